@@ -13,7 +13,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 MACHINES = {"amd64": 62, "arm64": 183}
-"""ELF's e_machine: x86-64, AArch64."""
+"""Values of the ELF field e_machine for x86-64 and AArch64."""
 NEEDED = (
     "usr/bin/jointfitd", "usr/lib/systemd/system/jointfitd.service",
     "usr/lib/udev/rules.d/70-jointfitd.rules", "usr/share/man/man1/jointfitd.1.gz",
@@ -46,7 +46,7 @@ def faults(package: Path) -> Iterator[str]:
 
 
 def faults_of(name: str, content: bytes, machine: int, md5: str) -> Iterator[str]:
-    """Yield the defects of a file of a package."""
+    """Yield the defects of one file in a package."""
     if hashlib.md5(content).hexdigest() != md5:  # noqa: S324 - dpkg's format
         yield f"{name}: checksum differs from md5sums"
     if content[:4] == b"\x7fELF" and int.from_bytes(content[18:20], "little") != machine:

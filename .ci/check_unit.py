@@ -1,4 +1,4 @@
-"""Check the systemd units: systemd can read them, and their exposure stays at or under 1.2."""
+"""Check that systemd can read the systemd units, and that their exposure is at most 1.2."""
 
 import shutil
 import subprocess
@@ -6,9 +6,9 @@ import sys
 from pathlib import Path
 
 UNITS = sorted((Path(__file__).resolve().parents[1] / "systemd").glob("jointfitd*.service"))
-THRESHOLD = "12"  # tenths, as systemd-analyze counts
+THRESHOLD = "12"  # tenths, as in systemd-analyze
 ELSEWHERE = "/usr/bin/jointfitd"
-"""Program of ExecStart; it is not installed where the unit is only checked."""
+"""Program in ExecStart. It is not installed on a machine that only checks the unit."""
 
 
 def analyze(unit: Path, *arguments: str) -> subprocess.CompletedProcess[str]:

@@ -1,7 +1,8 @@
 """Build wheels and sdist, check them, install each as a user would: `check_wheel.py [FOLDER]`.
 
-All into empty environments: the wheels by pip, the sdist by pipx. FOLDER receives the archives. The
-compiled wheel is made if this machine has a C compiler and the headers of Python.
+Each archive is installed into an empty environment, the wheels by pip and the sdist by pipx. FOLDER
+receives the archives. The compiled wheel is built if this machine has a C compiler and Python's
+headers.
 """
 
 import hashlib
@@ -23,7 +24,7 @@ LOCK = ROOT / "requirements.lock"
 EXAMPLE = ROOT / "examples" / "knee.toml"
 COMMANDS = (["jointfitd", "--version"], ["jointfit", "--help"], ["jointfit-sim", "--help"])
 PAGE = "jointfit_daemon/tools/dashboard/page"
-"""Folder of the dashboard's page, which is no Python."""
+"""Folder of the dashboard's page, which contains no Python."""
 SHARED = (
     "lib/systemd/system/jointfitd.service",
     "lib/systemd/system/jointfitd@.service",
@@ -33,7 +34,7 @@ SHARED = (
 
 
 def run(*words: str | Path, cwd: Path, **environment: str) -> str:
-    """Run a command, usually away from the checkout, and return its output."""
+    """Run a command, usually outside the checkout, and return its output."""
     print("+", *words, flush=True)
     done = subprocess.run(  # noqa: S603 - our own commands
         [str(word) for word in words], cwd=cwd, text=True, check=False, capture_output=True,
@@ -51,14 +52,14 @@ def build(folder: Path, *options: str, compiled: bool = False) -> None:
 
 
 def try_out(binaries: Path, work: Path) -> None:
-    """Run the commands that were installed."""
+    """Run the installed commands."""
     for command, *arguments in COMMANDS:
         run(binaries / command, *arguments, cwd=work)
     run(binaries / "jointfitd", "--config", EXAMPLE, "--check", cwd=work)
 
 
 def carry_the_page(wheel: Path) -> None:
-    """End unless the wheel contains every file of the dashboard's page."""
+    """Exit with an error if the wheel lacks a file of the dashboard's page."""
     with zipfile.ZipFile(wheel) as archive:
         packed = set(archive.namelist())
     files = {path for path in (ROOT / PAGE).rglob("*") if path.is_file()}
@@ -68,7 +69,7 @@ def carry_the_page(wheel: Path) -> None:
 
 
 def install(archive: Path, work: Path, variant: str) -> None:
-    """Install into an empty environment and try it, also without the compiled modules."""
+    """Install an archive into an empty environment and try it, also without compiled modules."""
     home = work / f"venv-{variant}"
     venv.create(home, with_pip=True)
     run(home / "bin" / "pip", "install", "--quiet", "--constraint", LOCK, archive, cwd=work)
@@ -83,7 +84,7 @@ def install(archive: Path, work: Path, variant: str) -> None:
 
 
 def install_by_pipx(archive: Path, work: Path) -> None:
-    """Install as a program of a user."""
+    """Install an archive with pipx, as a user would."""
     places = {"PIPX_HOME": str(work / "pipx"), "PIPX_BIN_DIR": str(work / "bin")}
     run(
         sys.executable, "-m", "pipx", "install", "--quiet", "--python", sys.executable,
@@ -94,7 +95,7 @@ def install_by_pipx(archive: Path, work: Path) -> None:
 
 
 def main() -> None:
-    """Build, check, install, run; end with the output of the first step that fails."""
+    """Build, check, install and run; exit with the output of the first step that fails."""
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         build(work / "first")

@@ -1,15 +1,17 @@
-"""Run the numerical tests as on other processors: `make test-cpu`.
+"""Run the numerical tests with the arithmetic of other processors: `make test-cpu`.
 
     .ci/cpu_features.py [--all] [PYTEST ARGUMENTS]
 
-Kernels of OpenBLAS and loops of numpy round differently on each processor. A decision that
-depends on last bits shows itself by a test that passes in one of these runs and fails in another.
-A run has the kernels (``OPENBLAS_CORETYPE``) and the loops (``NPY_DISABLE_CPU_FEATURES``) of one
-processor. The newest one is left out where `make test` runs on it anyway, and one that this
-processor cannot execute is skipped with its reason. After a failure, or with ``--all``, more runs
-follow; two combine the oldest with the newest, which separates kernels from loops as the cause.
+Kernels of OpenBLAS and loops of numpy round differently on each processor. If a decision depends on
+the last bits, a test passes in one of these runs and fails in another.
 
-Exit status: 0 if every run passed, 1 otherwise.
+A run has the kernels (``OPENBLAS_CORETYPE``) and the loops (``NPY_DISABLE_CPU_FEATURES``) of one
+processor. The newest processor is omitted if `make test` runs on it in any case. A processor whose
+instructions this machine cannot execute is skipped with its reason. After a failure, or with
+``--all``, more runs follow. Two of them combine the oldest with the newest, which separates kernels
+from loops as the cause.
+
+The exit status is 0 if every run passed, and 1 otherwise.
 """
 
 from __future__ import annotations
@@ -32,19 +34,20 @@ TESTS = [
     )
 ]  # fmt: skip
 """Tests of packages that compute with numpy. Plain Python, such as the device clocks and the frames
-of the core, rounds alike on all processors."""
+of the core, rounds equally on all processors."""
 
 
 @dataclass(frozen=True)
 class Processor:
-    """A processor as OpenBLAS and numpy distinguish them, or a combination of two."""
+    """A type of processor that OpenBLAS and numpy distinguish, or a combination of two types."""
 
     core_type: str
-    """Name of its kernels in OpenBLAS."""
+    """Name of the processor's kernels in OpenBLAS."""
     flag: str
-    """Flag of /proc/cpuinfo that the kernels need."""
+    """Flag in /proc/cpuinfo that the kernels need."""
     steps: int | None
-    """Steps of numpy above its baseline that this processor has; None: all that this one has."""
+    """Number of numpy's feature levels above its baseline that this processor has; None for all
+    levels of this machine."""
 
 
 PROCESSORS = (
@@ -52,18 +55,18 @@ PROCESSORS = (
     Processor("Haswell", "avx2", 1),
     Processor("SkylakeX", "avx512f", None),
 )
-"""Each kind of loop occurs in one of them, and each kind of kernel."""
+"""Processors of the first runs. They include each type of loop and each type of kernel."""
 FURTHER = (
     Processor("Zen", "avx2", 1),
     Processor("Nehalem", "sse4_2", None),
     Processor("SkylakeX", "avx512f", 0),
 )
-"""Zen has the kernels of Haswell with other block sizes. The others are no real processors: kernels
-of one, loops of another."""
+"""Processors of the additional runs. Zen has the kernels of Haswell with other block sizes. The
+other entries are not real processors: they combine the kernels of one with the loops of another."""
 
 
 def main(arguments: list[str]) -> int:
-    """Run all; print a line for each; return the exit status."""
+    """Run the tests for all processors; print one line for each; return the exit status."""
     wants_all = "--all" in arguments
     tests = [word for word in arguments if word != "--all"] or TESTS
     flags = Path("/proc/cpuinfo").read_text(encoding="utf-8").split()
@@ -85,7 +88,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _passes(processor: Processor, tests: list[str]) -> bool:
-    """Run the tests as on a processor, and report it; return whether all passed."""
+    """Run the tests for one processor, and print the result; return whether all passed."""
     steps = [name for name in umath.__cpu_dispatch__ if umath.__cpu_features__[name]]
     disabled = [] if processor.steps is None else steps[processor.steps :]
     name = processor.core_type + (f" without {','.join(disabled)}" if disabled else "")
@@ -98,7 +101,7 @@ def _passes(processor: Processor, tests: list[str]) -> bool:
     environment = os.environ | {
         "OPENBLAS_CORETYPE": processor.core_type,
         "NPY_DISABLE_CPU_FEATURES": ",".join(disabled),
-        "HYPOTHESIS_PROFILE": "few",  # `make test` draws more
+        "HYPOTHESIS_PROFILE": "few",  # `make test` draws more examples
     }
     status = subprocess.run(command, check=False, env=environment).returncode  # noqa: S603 - ours
 

@@ -1,7 +1,7 @@
-"""Debian roots made with mmdebstrap once a week and kept: the disk of a machine, a minimal system.
+"""Debian root file systems, which mmdebstrap makes once a week for virtual machines and tests.
 
-Invariant: a root holds Debian and nothing of the project, so it stays good from commit to commit.
-Its name is a digest of its packages and scripts and of the week: a new week brings Debian's
+Invariant: a root contains only Debian and no part of the project, so it is valid for every commit.
+Its name is a digest of its packages, its scripts and the week. In a new week, it contains Debian's
 security updates.
 """
 
@@ -27,7 +27,7 @@ _KEPT_DAYS = 21
 
 
 class RootBuildError(Exception):
-    """The root cannot be made here, and why."""
+    """The root cannot be made on this machine; the message names the reason."""
 
 
 def kept(
@@ -39,20 +39,20 @@ def kept(
     *,
     suite: str = SUITE,
 ) -> Path:
-    """Return a file that is made once a week.
+    """Return the path of a file that is made once a week.
 
     Parameters
     ----------
     name
-        Begin and end of the file's name, as ``vm.ext4``.
+        First and last part of the file name, such as ``vm.ext4``.
     recipe
-        Text of how it is made: changed, it makes a new one.
+        Text that describes how the file is made. If the text changes, a new file is made.
     tools
-        Programs that `make` needs, and their Debian packages.
+        Programs that `make` needs, each with its Debian package.
     make
-        Makes the file in an empty folder and returns its path.
+        Function that makes the file in an empty folder and returns its path.
     cache
-        Folder of the files that are kept.
+        Folder of the stored files.
     suite
         Release of Debian.
 
@@ -84,8 +84,8 @@ def kept(
 def bootstrap(
     packages: Sequence[str], hooks: Sequence[str], work: Path, suite: str = SUITE
 ) -> Path:
-    """Make ``rootfs.tar`` in `work`: minbase and `packages`, without manual pages."""
-    # Unstable has no security updates that an old mirror would hide.
+    """Make ``rootfs.tar`` in `work` from minbase and `packages`, without manual pages."""
+    # An old mirror of unstable hides no security updates, because unstable has none.
     options = ["--aptopt=Acquire::Check-Valid-Until no"] if suite == "sid" else []
     command = [
         "mmdebstrap", "--variant=minbase", f"--include={','.join(packages)}",
@@ -97,7 +97,7 @@ def bootstrap(
 
 
 def run(words: list[str], work: Path) -> None:
-    """Run a command in `work`; raise `RootBuildError` with the end of its errors if it fails."""
+    """Run a command in `work`; if it fails, raise `RootBuildError` with the end of its errors."""
     done = subprocess.run(  # noqa: S603 - fixed commands
         words, cwd=work, env=os.environ | {"PATH": SEARCH}, text=True, capture_output=True,
         check=False, stdin=subprocess.DEVNULL,

@@ -1,14 +1,15 @@
 #!/usr/bin/env python3
-"""Run the service as it is installed: the Debian package in a virtual machine with real systemd.
+"""Run the installed service: the Debian package in a virtual machine with real systemd.
 
     .ci/full_vm.py [--deb FILE] [--image FILE] [--time-limit S] [--out DIR] [-- PYTEST ARGUMENTS]
 
-Boots Debian (``vm_image.py``) under user-mode-linux, installs the package, brings up a real vcan
-and a real mosquitto with TLS and passwords, and runs ``tests/vm_service`` inside. Each run writes
-to a disk of its own that is thrown away.
+The script boots Debian (``vm_image.py``) under user-mode-linux and installs the package. It starts
+a real vcan interface and a real mosquitto with TLS and passwords, and runs ``tests/vm_service``
+inside. Each run writes to its own temporary disk.
 
-Exit status as of ``light_vm.py``: that of pytest; 1 if a test was skipped or none ran; 90 if the
-guest never got as far; 124 at the time limit; 2 if the machine cannot be started at all.
+The exit status is the same as for ``light_vm.py``: the status of pytest; 1 if a test was skipped or
+no test ran; 90 if the guest did not reach the end of pytest; 124 at the time limit; 2 if the
+machine cannot be started.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ UNUSED = (
     "modprobe@drm.service", "modprobe@efi_pstore.service", "modprobe@fuse.service",
     "modprobe@loop.service", "apt-daily.timer", "apt-daily-upgrade.timer",
 )  # fmt: skip
-"""Units of Debian that the tests do not need; masking them saves a second and a half of boot."""
+"""Debian units that the tests do not need. Without them, the boot is one and a half seconds faster.
+"""
 START = (
     "echo {no_result} > /proc/exitcode; mount -t hostfs none /mnt -o {share} "
     "&& sh /mnt/vm_service/guest.sh > /mnt/guest.log 2>&1; echo $? > /proc/exitcode"
@@ -70,7 +72,7 @@ def main() -> int:
 
 
 def build_deb(work: Path, *extra: str) -> Path:
-    """Return the package of this checkout."""
+    """Build the package of this checkout, and return its path."""
     say("building the package")
     words = [sys.executable, str(CHECKOUT / "packaging" / "deb.py"), "--out", str(work), *extra]
     done = subprocess.run(words, text=True, capture_output=True, check=False)  # noqa: S603 - ours
@@ -80,7 +82,7 @@ def build_deb(work: Path, *extra: str) -> Path:
 
 
 def fill(share: Path, deb: Path, tests: list[str]) -> None:
-    """Fill the folder shared with the guest; remove files of an earlier run."""
+    """Fill the folder that is shared with the guest; remove files of an earlier run."""
     share.mkdir(parents=True, exist_ok=True)
     for leftover in ("junit.xml", "pytest.log", "guest.log", "journal.txt", "console.log"):
         (share / leftover).unlink(missing_ok=True)
@@ -92,7 +94,7 @@ def fill(share: Path, deb: Path, tests: list[str]) -> None:
 
 
 def make_newer(deb: Path, newer: Path) -> None:
-    """Write the same package with a higher version, for the upgrade."""
+    """Write the same package with a higher version, for the test of an upgrade."""
     with tempfile.TemporaryDirectory(prefix="newer-deb-") as scratch:
         tree = Path(scratch) / "tree"
         subprocess.run(["dpkg-deb", "-R", str(deb), str(tree)], check=True)  # noqa: S603, S607 - Debian's
@@ -112,7 +114,7 @@ def make_newer(deb: Path, newer: Path) -> None:
 
 
 def run(work: Path, disk: Path, share: Path, memory: str, limit_s: float) -> int:
-    """Boot; return the exit status."""
+    """Boot the machine; return the exit status."""
     service = START.format(no_result=uml.NO_RESULT, share=share)
     guest = uml.NO_AVX if uml.has_amx() else {}
     command = [
@@ -120,7 +122,7 @@ def run(work: Path, disk: Path, share: Path, memory: str, limit_s: float) -> int
         "rootfstype=ext4", "rw", *uml.CONSOLE, "systemd.show_status=0",
         *(f"systemd.mask={unit}" for unit in UNUSED),
         *(f"{name}={value}" for name, value in guest.items()),  # for PID 1
-        *(f"systemd.setenv={name}={value}" for name, value in guest.items()),  # for all others
+        *(f"systemd.setenv={name}={value}" for name, value in guest.items()),  # for other processes
         f"systemd.run=\"/bin/sh -c '{service}'\"",  # the quotes must reach the kernel
         "systemd.run_success_action=poweroff", "systemd.run_failure_action=poweroff",
     ]  # fmt: skip

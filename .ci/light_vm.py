@@ -3,12 +3,12 @@
 
     .ci/light_vm.py [--time-limit S] [--memory M] [--out DIR] [-- PYTEST ARGUMENTS]
 
-Boots Debian's user-mode-linux (packages: user-mode-linux, iproute2) on the host's own files,
-read-only, brings up vcan0 and runs ``pytest -m vm tests/vm`` with the Python that runs this script.
-Nothing of the host can be written but DIR, which gets junit.xml.
+The script boots Debian's user-mode-linux (packages: user-mode-linux, iproute2) on the host's own
+files, which are read-only. It starts vcan0 and runs ``pytest -m vm tests/vm`` with the Python that
+runs this script. The guest can write to DIR only, which receives junit.xml.
 
-Exit status: that of pytest; 1 if a test was skipped or none ran; 90 if the guest never got as far
-as pytest's end; 124 at the time limit; 2 if the machine cannot be started at all.
+The exit status is the status of pytest; 1 if a test was skipped or no test ran; 90 if the guest did
+not reach the end of pytest; 124 at the time limit; 2 if the machine cannot be started.
 """
 
 # ruff: noqa: S108 - the guest's folders are named, not used here
@@ -36,7 +36,7 @@ CAN_MODULES = (
     "drivers/net/veth",
 )
 HIDDEN = ("/tmp", "/run", "/var/tmp", "/mnt")
-"""Folders that are empty in the guest; needed parts of them are mounted back."""
+"""Folders that are empty in the guest. Their needed parts are mounted again."""
 
 PREPARE = """\
 #!/bin/sh
@@ -69,7 +69,7 @@ exec {python} -c 'import ctypes; ctypes.CDLL(None).reboot(0x4321fedc)'
 
 
 def main() -> int:
-    """Boot, run, judge."""
+    """Boot the machine, run the tests, and evaluate their report."""
     given = arguments()
     if given.guest_modules:
         return load_modules()
@@ -93,7 +93,7 @@ def main() -> int:
 
 
 def arguments() -> argparse.Namespace:
-    """Return the arguments of the command line."""
+    """Return the command-line arguments."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--time-limit", type=float, default=180.0, help="seconds, whole run")
     parser.add_argument("--memory", default="512M", help="memory of the guest")
@@ -104,7 +104,7 @@ def arguments() -> argparse.Namespace:
 
 
 def mounts(out: Path) -> list[str]:
-    """Return shell lines that hide the host's volatile folders and mount the needed ones back."""
+    """Return shell commands that hide the host's volatile folders and mount the needed parts."""
     needed = {CHECKOUT, Path(sys.prefix), Path(sys.base_prefix)}
     shared = CHECKOUT.parent / "shared" / "data"
     if shared.is_dir():
@@ -137,7 +137,7 @@ def write_init(path: Path, out: Path, commands: str, **words: str) -> None:
 
 
 def machine_command(work: Path, memory: str, *more: str) -> list[str]:
-    """Return the command of a machine on the host's own files, read-only."""
+    """Return the command of a machine on the host's own files, which are read-only."""
     return [
         uml.UML, f"mem={memory}", "rootfstype=hostfs", "rootflags=/", "ro", f"init={work / 'init'}",
         *uml.CONSOLE, "quiet", f"uml_dir={work}", "umid=light", *more,
@@ -145,7 +145,7 @@ def machine_command(work: Path, memory: str, *more: str) -> list[str]:
 
 
 def load_modules() -> int:
-    """In the guest: load the CAN modules without kmod."""
+    """Load the CAN modules without kmod, in the guest."""
     libc = ctypes.CDLL(None, use_errno=True)
     for name in CAN_MODULES:
         path = uml.MODULES / os.uname().release / "kernel" / f"{name}.ko"

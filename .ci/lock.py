@@ -1,8 +1,8 @@
 """Print the installed distributions as constraints: the exact versions for CI and `make`.
 
-A constraint installs nothing by itself: a line for something that a machine does not need is
-without effect there. But every line must fit every Python that the project supports: Debian 12
-has 3.11.2, and a release that wants 3.11.5 cannot be installed there.
+A constraint does not install a package, so a line for an unneeded package has no effect. Every line
+must support every Python version of the project. For example, Debian 12 has Python 3.11.2, and a
+release that requires 3.11.5 cannot be installed there.
 """
 
 import sys
@@ -17,12 +17,12 @@ SKIP = {"jointfitd", "pip", "setuptools", "wheel"}
 
 
 def name_of(dist: Distribution) -> str:
-    """Return the normalised name."""
+    """Return the normalised name of a distribution."""
     return dist.metadata["Name"].lower().replace("_", "-")
 
 
 def main() -> None:
-    """Print one sorted line a distribution; end with 1 where one is too new for our Python."""
+    """Print one sorted line per distribution; exit with 1 if one is too new for our Python."""
     project = tomllib.loads(PROJECT.read_text(encoding="utf-8"))["project"]
     oldest = project["requires-python"].removeprefix(">=") + ".0"
     locked = sorted((dist for dist in distributions() if name_of(dist) not in SKIP), key=name_of)

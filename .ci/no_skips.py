@@ -1,10 +1,11 @@
 """Fail when a test that CI must run was skipped: `no_skips.py [--minimal] JUNIT.xml ...`.
 
-Some tests may be skipped in that step. Those of tests/vm: a later step runs them on a kernel
-that has vcan, and fails if one is skipped there. Those that need something that cannot be
-installed: recordings that are not part of the project, a network interface that carries multicast,
-packages that need hardware. And the parts of the conformance suite that a protocol rules out.
-On the minimal system tests that need a Debian package may be skipped as well; here they run.
+Some tests may be skipped in that step. Tests of tests/vm may be skipped, because a later step runs
+them on a kernel with vcan and fails if one is skipped. Tests may be skipped if their requirement
+cannot be installed: recordings that are not part of the project, a network interface with
+multicast, or packages that need hardware. Parts of the conformance suite that a protocol excludes
+may be skipped. On the minimal system, tests that need a Debian package may also be skipped; on
+other systems, they must run.
 """
 
 import sys
@@ -21,7 +22,7 @@ NOT_INSTALLABLE = (
     "this wire does not allow detection of a wrong device",
     "bytes of this wire take no time",
 )
-"""Reasons of tests that a clean machine may skip; they are counted and printed."""
+"""Reasons for which a clean machine may skip tests. They are counted and printed."""
 NOT_IN_MINIMAL = (
     *(
         f"(Debian: apt install {package})"
@@ -30,11 +31,11 @@ NOT_IN_MINIMAL = (
     "needs a host whose own name has an address",
     "make mutation installs it",
 )
-"""Further reasons of tests that the minimal system may skip."""
+"""Additional reasons for which the minimal system may skip tests."""
 
 
 def skipped(cases: list[ET.Element]) -> list[tuple[str, str]]:
-    """Return name and reason of the tests that were skipped, without those of tests/vm."""
+    """Return name and reason of each skipped test, except tests of tests/vm."""
     return [
         (name, found.get("message") or "no reason given")
         for case in cases
@@ -45,7 +46,7 @@ def skipped(cases: list[ET.Element]) -> list[tuple[str, str]]:
 
 
 def main(words: list[str]) -> int:
-    """Print the skipped tests; return 1 if one of them had to run, or if no test ran."""
+    """Print the skipped tests; return 1 if a required test was skipped or no test ran."""
     reports = [Path(word) for word in words if word != "--minimal"]
     allowed = NOT_INSTALLABLE + (NOT_IN_MINIMAL if "--minimal" in words else ())
     trees = [ET.parse(report) for report in reports]  # noqa: S314 - pytest's, just made

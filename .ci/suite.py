@@ -1,15 +1,15 @@
-"""Run the tests on all cores, then those that measure time alone: `make test`.
+"""Run the tests on all cores, then the time measurements without other tests: `make test`.
 
     .ci/suite.py [--experiments] [PYTEST ARGUMENTS]
 
-With ``--experiments`` the tests with the marker ``experiment`` run, otherwise all others. Each part
-leaves a JUnit report in ``build/tests`` or ``build/experiments``; the last line counts the tests of
-both parts and the seconds.
+With ``--experiments``, the tests with the marker ``experiment`` run; otherwise, all other tests
+run. Each part writes a JUnit report to ``build/tests`` or ``build/experiments``. The last line
+contains the number of tests in both parts, and the time in seconds.
 
 System tests start daemons in real time, and tests with the marker `real_time` simulate devices that
-send in real time. Other tests on the same cores can starve both. One that fails while others run is
-repeated once, alone: it passes only if it passes then, and the summary names it. All other tests
-get no second chance.
+send in real time. Other tests on the same cores can delay both. If such a test fails while others
+run, it is repeated once, alone. It passes only if it then passes, and the summary names it. Other
+tests are not repeated.
 
 Invariant: the exit status is 0 only if both parts passed.
 """
@@ -26,13 +26,16 @@ from pathlib import Path
 
 BUILD = Path(__file__).resolve().parents[1] / "build"
 WORKERS_PER_CORE = 3
-"""Two thirds of the time of the tests is waiting, for devices and daemons in real time."""
+"""Number of workers per core. For two thirds of their time, tests wait for devices and daemons in
+real time."""
 EXPERIMENTS_PER_CORE = 2
-"""Experiments compute, or run whole daemons with browsers: more of them starve each other."""
+"""Number of workers per core for experiments, which compute, or run daemons and browsers. More
+workers would delay each other."""
 WORKERS = ("-p", "tests.forked_workers", "--workers")
-"""Options of pytest that run the tests in workers; the number follows."""
+"""Options of pytest that run the tests in workers. The number of workers follows."""
 ENVIRONMENT = {key: os.environ[key] for key in os.environ if key != "PYTHONDONTWRITEBYTECODE"}
-"""Hundreds of processes import the project: none should have to compile it."""
+"""Environment of the tests. Hundreds of processes import the project, so it must be compiled only
+once."""
 TESTS_FAILED = 1
 """Exit status of pytest when tests failed."""
 NO_TESTS = 5
@@ -70,7 +73,7 @@ def main(arguments: list[str]) -> int:
     failed = [status for status in (parallel, alone) if status not in {0, NO_TESTS}]
     if failed:
         return failed[0]
-    return min(parallel, alone)  # nothing was collected only if neither part collected anything
+    return min(parallel, alone)  # NO_TESTS only if both parts collected nothing
 
 
 def _run(part: str, reports: Path, arguments: list[str], report: str = "") -> int:
@@ -80,13 +83,13 @@ def _run(part: str, reports: Path, arguments: list[str], report: str = "") -> in
 
 
 def _files_of_tests_alone() -> list[str]:
-    """Return the test files with the marker `alone`: to collect all others takes ten seconds."""
+    """Return the test files with the marker `alone`; collecting all files takes ten seconds."""
     files = sorted((BUILD.parent / "tests").rglob("test_*.py"))
     return [str(path) for path in files if "mark.alone" in path.read_text(encoding="utf-8")]
 
 
 def _repeat_tests_in_real_time(part: str, reports: Path) -> list[str]:
-    """Repeat failed tests in real time alone; return their names if this cleared all failures."""
+    """Repeat the failed real-time tests alone; return their names if all then passed."""
     chosen = "system or real_time"
     selection = ["--last-failed", "--last-failed-no-failures=none", "-m", chosen]
     if _run(part, reports, selection, report="repeated") != 0:
@@ -101,7 +104,7 @@ def _repeat_tests_in_real_time(part: str, reports: Path) -> list[str]:
 
 
 def _cases(report: Path) -> list[tuple[str, ET.Element]]:
-    """Return the tests of a report by name."""
+    """Return the tests in a report, each with its name."""
     cases = ET.parse(report).getroot().iter("testcase")  # noqa: S314 - pytest's, just made
     return [(f"{case.get('classname')}::{case.get('name')}", case) for case in cases]
 
@@ -118,7 +121,7 @@ def _counts(reports: Path, disturbed: list[str]) -> str:
         for key in ("tests", "failures", "errors", "skipped")
     )
     passed = total - failed - errors - skipped
-    if disturbed:  # they have passed alone
+    if disturbed:  # these tests passed alone
         passed, failed, errors = passed + failed + errors, 0, 0
     return f"{passed} passed, {failed} failed, {errors} errors, {skipped} skipped"
 

@@ -1,4 +1,4 @@
-"""The disk of the full virtual machine: Debian with systemd, made once a week and kept.
+"""Disk of the full virtual machine (Debian with systemd), which is made once a week.
 
 .ci/vm_image.py [--cache DIR]          prints the path of the image
 """
@@ -11,14 +11,14 @@ from pathlib import Path
 
 from debian_root import CACHE, RootBuildError, bootstrap, kept, run
 
-SIZE = "2G"  # sparse; the package and what tests write must fit
+SIZE = "2G"  # sparse file for package and test data
 PACKAGES = (
     "systemd", "systemd-sysv", "udev", "dbus", "kmod", "iproute2", "procps", "python3",
     "python3-pytest", "mosquitto", "mosquitto-clients", "openssl", "can-utils",
 )  # fmt: skip
 TOOLS = {"mmdebstrap": "mmdebstrap", "mke2fs": "e2fsprogs", "fakeroot": "fakeroot"}
 HOOKS = (
-    # minbase has no hosts file: localhost would not resolve
+    # Without a hosts file, as in minbase, localhost does not resolve.
     'printf "127.0.0.1 localhost vm\\n::1 localhost\\n" > "$1/etc/hosts"',
     'echo vm > "$1/etc/hostname"; : > "$1/etc/machine-id"; mkdir -p "$1/usr/lib/modules"',
 )
@@ -32,7 +32,7 @@ rm -r rootfs rootfs.tar
 
 
 def main() -> int:
-    """Print the image's path, having made it where it was not there."""
+    """Print the path of the image, which is made if it does not exist."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--cache", type=Path, default=CACHE, metavar="DIR")
     try:
@@ -44,7 +44,7 @@ def main() -> int:
 
 
 def image(cache: Path = CACHE) -> Path:
-    """Return the image for this week, made if need be (about a minute).
+    """Return the image for this week; make it if necessary (about a minute).
 
     Raises
     ------

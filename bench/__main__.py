@@ -1,8 +1,9 @@
 """Run experiments: ``python -m bench [ID ...]``.
 
-Without IDs the short set runs, at most 10 minutes on two cores; ``--full`` runs all experiments.
-Results are stored in ``bench/results`` and the pages of docs are generated again. The exit code is
-1 if a result misses its threshold and is not listed in `Experiment.known_misses`.
+Without IDs, the short set of experiments runs, at most 10 minutes on two cores. The option
+``--full`` runs all experiments. Results are stored in ``bench/results``, and the pages of docs are
+generated again. The exit code is 1 if a result misses its threshold and is not listed in
+`Experiment.known_misses`.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).resolve().parents[1]
 SINGLE_THREAD = {"OPENBLAS_NUM_THREADS": "1"}
-"""Environment of speed experiments, as in the units of the daemon and in its fits."""
+"""Environment variables for speed experiments; the systemd units of the daemon and its fits have
+the same values."""
 
 Measured = list[tuple[Experiment, list[Result]]]
 
@@ -61,7 +63,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def _measure(chosen: Sequence[Experiment], options: argparse.Namespace, *, quick: bool) -> Measured:
-    """Run experiments, each stored as soon as it has ended; shortened ones are not stored."""
+    """Run experiments, and store each result at once; results of shortened runs are not stored."""
     measured: Measured = []
     for experiment, results in run_all(chosen, quick=quick, single_thread=options.single_thread):
         measured.append((experiment, results))
@@ -98,7 +100,7 @@ def _parser() -> argparse.ArgumentParser:
 def run_all(
     chosen: Sequence[Experiment], *, quick: bool, single_thread: bool = False
 ) -> Iterator[tuple[Experiment, list[Result]]]:
-    """Run experiments in order; those of speed in a process of their own with one BLAS thread."""
+    """Run experiments in order; speed experiments run in their own process with one BLAS thread."""
     fast = [] if single_thread else [e for e in chosen if e.topic == "speed"]
     for experiment in chosen:
         if experiment not in fast:
@@ -108,7 +110,7 @@ def run_all(
 
 
 def run_one(experiment: Experiment, *, quick: bool) -> list[Result]:
-    """Return the results of one experiment; none if recordings or packages are missing."""
+    """Return the results of one experiment; no results if recordings or packages are missing."""
     if (reason := experiment.missing()) is not None:
         print(f"{experiment.id} skipped: {reason}", file=sys.stderr)
         return []

@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """Build, list and sign a release: `python packaging/release.py --key KEY.pem [--out DIR]`.
 
-A release is a folder: wheels, source archive, Debian packages, bill of materials (CycloneDX),
-``SHA256SUMS`` with the checksum of each of these files, and ``SHA256SUMS.sig``, the Ed25519
-signature of that list. KEY.pem is a private key of OpenSSL; it is read by ``openssl`` only.
+A release is a folder with wheels, source archive, Debian packages and bill of materials
+(CycloneDX). ``SHA256SUMS`` contains the checksum of each of these files. ``SHA256SUMS.sig`` is the
+Ed25519 signature of that list. KEY.pem is a private key of OpenSSL, which only ``openssl`` reads.
 
 Invariant: the folder exists only if it is complete and its signature was verified.
 """
@@ -23,14 +23,14 @@ ROOT = Path(__file__).resolve().parents[1]
 SUMS = "SHA256SUMS"
 SIGNATURE = "SHA256SUMS.sig"
 ALGORITHM = "ED25519"
-"""Signatures of this kind need no choice of hash and padding, and are short."""
+"""Signature algorithm. It has short signatures and requires no selection of hash and padding."""
 BUILDERS = (
     (".ci/check_wheel.py", "{folder}"),
     ("packaging/deb.py", "--arch", "amd64", "--out", "{folder}"),
     ("packaging/deb.py", "--arch", "arm64", "--out", "{folder}"),
     ("packaging/sbom.py", "--out", "{folder}"),
 )
-"""Programs that write the files of a release to a folder, with their arguments."""
+"""Programs, with arguments, that write the files of a release to a folder."""
 
 
 class ReleaseError(Exception):
@@ -38,7 +38,7 @@ class ReleaseError(Exception):
 
 
 def main() -> int:
-    """Make the release and print its folder; return 1 if it cannot be made."""
+    """Make the release, and print its folder; return 1 if the release cannot be made."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--key", type=Path, required=True, metavar="KEY.pem", help="Ed25519 key")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "release", metavar="DIR")
@@ -57,10 +57,10 @@ def make_release(key: Path, out: Path) -> Path:
     Raises
     ------
     ReleaseError
-        The key is no Ed25519 key, the checkout differs from its commit, the folder exists, or
-        a build failed.
+        The key is not an Ed25519 key, the checkout differs from its commit, the folder exists, or a
+        build failed.
     """
-    # The faults of a minute come before the builds of ten.
+    # These checks are fast and precede the builds, which take minutes.
     check_key(key)
     _check_checkout()
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -81,7 +81,7 @@ def make_release(key: Path, out: Path) -> Path:
 
 
 def check_key(key: Path) -> None:
-    """Raise `ReleaseError` unless `key` is the file of a private Ed25519 key."""
+    """Raise `ReleaseError` if `key` is not the file of a private Ed25519 key."""
     if shutil.which("openssl") is None:
         raise ReleaseError("openssl is not installed (Debian: apt install openssl)")
     if not key.is_file():
@@ -93,12 +93,12 @@ def check_key(key: Path) -> None:
 
 
 def sign_release(folder: Path, key: Path) -> None:
-    """Write the checksums of all files of `folder`, and their signature, which is verified.
+    """Write the checksums of all files in `folder` and their signature; verify the signature.
 
     Raises
     ------
     ReleaseError
-        There is no file to sign, or openssl failed.
+        The folder contains no file, or openssl failed.
     """
     files = sorted(path for path in folder.iterdir() if path.name not in {SUMS, SIGNATURE})
     if not files:
@@ -125,7 +125,7 @@ def _check_checkout() -> None:
 
 
 def _run(words: list[str | Path]) -> str:
-    """Return the output of a command; raise `ReleaseError` with its errors if it fails."""
+    """Return the output of a command; raise `ReleaseError` with its error text if it fails."""
     done = subprocess.run(  # noqa: S603 - our own commands
         [str(word) for word in words], text=True, check=False, capture_output=True,
     )  # fmt: skip

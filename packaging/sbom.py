@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """Write the software bill of materials: `python packaging/sbom.py [--out DIR]`.
 
-Invariant: the list contains the packages that are installed, not those that were requested. The
-project and the extras of the Debian package are installed into an empty environment, which is then
-listed as CycloneDX JSON; the same versions give the same bytes.
+Invariant: the list contains the installed packages, not the requested packages. The project and the
+extras of the Debian package are installed into an empty environment, which is then listed as
+CycloneDX JSON. The same versions yield identical bytes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ TOOL = Path(sys.executable).with_name("cyclonedx-py")
 
 
 def main() -> int:
-    """Write the list and print its path."""
+    """Write the list, and print its path."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "packages", metavar="DIR")
     out: Path = parser.parse_args().out.resolve()

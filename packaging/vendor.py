@@ -1,7 +1,8 @@
 """Fetch the vendored scripts of the dashboard again: `python packaging/vendor.py`.
 
-`vendored_scripts.json` names packages, versions, licences, files and their SHA-256. Each package is
-fetched by `npm pack`, which runs no script of it. A file with another checksum is not written.
+The file `vendored_scripts.json` lists packages, versions, licences, files and their SHA-256. Each
+package is fetched by `npm pack`, which runs no script of the package. A file with another checksum
+is not written.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ VENDOR = ROOT / "jointfit_daemon/tools/dashboard/page/vendor"
 
 
 def fetch(package: dict[str, Any], folder: Path) -> dict[str, bytes]:
-    """Return the files of a package by their name in the vendor folder."""
+    """Return the files of a package, by their names in the vendor folder."""
     npm = shutil.which("npm")
     if npm is None:
         sys.exit("npm is not installed (Debian: apt install npm)")
@@ -50,7 +51,7 @@ def fetch(package: dict[str, Any], folder: Path) -> dict[str, bytes]:
 
 
 def main() -> None:
-    """Fetch and write all files, or end with the first that differs."""
+    """Fetch and write all files; exit with an error at the first different file."""
     manifest = json.loads(MANIFEST.read_text(encoding="utf-8"))
     with tempfile.TemporaryDirectory(prefix="jointfit-vendor-") as folder:
         for package in manifest["packages"]:

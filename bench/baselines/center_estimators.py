@@ -1,6 +1,6 @@
-"""Hip and knee centers of recorded trials, estimated and compared with those of a model.
+"""Hip and knee centers of recorded trials, estimated and compared with the centers of a model.
 
-Invariant: the estimators receive the markers of two neighbouring segments only: no static trial, no
+Invariant: the estimators receive only the markers of two neighbouring segments: no static trial, no
 regression, no model. Distances are in parent coordinates, in which both centers are constant.
 """
 
@@ -34,7 +34,7 @@ _GAIT = ("Upper", "Front", "Rear")
 
 @dataclass(frozen=True, slots=True)
 class ModelJoint:
-    """Joint to estimate: its name in the model and the markers of its two segments."""
+    """Joint to estimate, with its name in the model and the markers of its two segments."""
 
     name: str
     model: str
@@ -44,30 +44,32 @@ class ModelJoint:
 
 @dataclass(frozen=True, slots=True)
 class EstimatedCenters:
-    """Estimates of one joint and the center of the model."""
+    """Estimates of one joint center, and the center in the model."""
 
     joint: ModelJoint
     reduced: ParentFrameMotion
     model: NDArray[np.float64]
-    """Mean center of the model in parent coordinates over its frames, m."""
+    """Mean center of the model over its frames, in parent coordinates, m."""
     wander: float
-    """RMS distance of the model's center from its mean, caused by soft-tissue artefact, m."""
+    """RMS distance of the model's center from its mean, m, caused by soft-tissue artefact."""
     estimates: dict[str, CenterEstimate]
-    """Estimate by method."""
+    """Estimates, by method."""
 
     def off(self, method: str) -> float:
         """Return the distance between estimate and model, m."""
         return float(np.linalg.norm(self.estimates[method].center - self.model))
 
     def off_axis(self, method: str) -> float:
-        """Return the distance perpendicular to the joint axis, m; along the axis of a hinge the
-        center is undetermined."""
+        """Return the distance perpendicular to the joint axis, m.
+
+        Along the axis of a hinge, the center is undetermined.
+        """
         gap = self.estimates[method].center - self.model
         axis = hinge(self.reduced)
         return float(np.linalg.norm(gap - axis * (gap @ axis)))
 
     def told_across(self, method: str) -> float:
-        """Return the RMS error perpendicular to the axis that the estimate predicts, m."""
+        """Return the predicted RMS error perpendicular to the axis, m."""
         axis = hinge(self.reduced)
         across = np.eye(3) - np.outer(axis, axis)
         spread = across @ self.estimates[method].covariance @ across
@@ -80,7 +82,8 @@ def hinge(reduced: ParentFrameMotion) -> NDArray[np.float64]:
     assert points is not None
     whole = points[np.isfinite(points).all(axis=(1, 2))]
     steps = whole - whole.mean(axis=0)
-    # The markers of a hinge move in planes across its axis: the direction of least variance.
+    # The markers of a hinge move in planes perpendicular to its axis, so the axis is the direction
+    # of least variance.
     _, vectors = np.linalg.eigh(np.einsum("tki,tkj->ij", steps, steps))
     return np.asarray(vectors[:, 0])
 

@@ -1,6 +1,6 @@
-"""Theory of circle centers that experiments and tests compare with: bounds, three-frame errors.
+"""Theory of circle centers for experiments and tests: bounds, and errors of three frames.
 
-A bound depends on the movement and the noise only. It is infinite where the movement carries no
+A bound depends on the movement and the noise only. It is infinite if the movement contains no
 information about the center.
 """
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 
 def circle_bound(angles: ArrayLike, noise: float, *, known_radius: bool = False) -> Array:
-    r"""Return the least covariance of a circle's center from points at these angles.
+    r"""Return the smallest covariance of a circle's center from points at these angles.
 
     .. math:: C = \sigma^2 \Big[ \sum_i u_i u_i^T \Big]^{-1}_{xy},
               \qquad u_i = (\cos\theta_i, \sin\theta_i, 1)
 
-    without the 1 where the radius is known.
+    If the radius is known, the 1 is omitted.
 
     Parameters
     ----------
@@ -32,12 +32,12 @@ def circle_bound(angles: ArrayLike, noise: float, *, known_radius: bool = False)
     noise : float
         Standard deviation of each coordinate, m.
     known_radius : bool
-        The radius need not be found.
+        Whether the radius is known.
 
     Returns
     -------
     ndarray, shape (2, 2)
-        m²; inf on the diagonal where the points do not show a center.
+        Covariance, m²; inf on the diagonal if the points determine no center.
     """
     t = np.asarray(angles, dtype=np.float64)
     columns = [np.cos(t), np.sin(t)]
@@ -52,7 +52,7 @@ def circle_bound(angles: ArrayLike, noise: float, *, known_radius: bool = False)
 
 
 def circle_rms_bound(angles: ArrayLike, noise: float, *, known_radius: bool = False) -> float:
-    """Return the least RMS error of a circle's center, m; parameters as in `circle_bound`."""
+    """Return the smallest RMS error of a circle's center, m, with the same parameters."""
     return float(np.sqrt(np.trace(circle_bound(angles, noise, known_radius=known_radius))))
 
 
@@ -75,13 +75,13 @@ def arbitrary_error(angles: ArrayLike, noise: ArrayLike) -> Array:
     Returns
     -------
     ndarray, shape (...)
-        RMS distance from the true center, m; inf where two angles coincide.
+        RMS distance from the true center, m; inf if two angles coincide.
     """
     t = np.asarray(angles, dtype=np.float64)
     d12, d13, d23 = t[..., 0] - t[..., 1], t[..., 0] - t[..., 2], t[..., 1] - t[..., 2]
     across = np.sin(d12) - np.sin(d13) + np.sin(d23)
 
-    # 1 - cos by half angles: the difference of cosines has no digits on short arcs
+    # Half angles give 1 - cos, because the difference of cosines has no precision on short arcs.
     square = 4.0 * (np.sin(d12 / 2) ** 2 + np.sin(d13 / 2) ** 2 + np.sin(d23 / 2) ** 2)
     return _ratio(np.asarray(noise) * np.sqrt(square), np.abs(across))
 
@@ -91,19 +91,19 @@ def triangle_error(points: ArrayLike, noise: ArrayLike) -> Array:
 
     .. math:: E = \sigma \frac{R}{2A} \sqrt{a^2 + b^2 + c^2}, \qquad R = abc / 4A
 
-    with sides a, b, c and area A.
+    Here a, b and c are the sides, and A is the area.
 
     Parameters
     ----------
     points : array_like, shape (..., 3, 2)
-        m.
+        Positions in the three frames, m.
     noise : array_like, shape (...)
         Standard deviation of each coordinate, m.
 
     Returns
     -------
     ndarray, shape (...)
-        RMS distance from the true center, m; inf where the points are on a line.
+        RMS distance from the true center, m; inf if the points are on a line.
     """
     p = np.asarray(points, dtype=np.float64)
     u, v = p[..., 1, :] - p[..., 0, :], p[..., 2, :] - p[..., 0, :]
@@ -114,22 +114,24 @@ def triangle_error(points: ArrayLike, noise: ArrayLike) -> Array:
 
 
 def _ratio(above: Array, below: Array) -> Array:
-    """Divide; no information is an infinite error, noise or not."""
+    """Return the ratio; without information, the error is infinite for any noise."""
     lost = below <= 0.0
     return np.where(lost, np.inf, above / np.where(lost, 1.0, below))
 
 
 def combine(estimates: list[CenterEstimate]) -> tuple[Array, Array]:
-    r"""Combine centers of independent markers by information, without outlier rejection.
+    r"""Combine the centers of independent markers, weighted by information.
 
-    Estimates with an unobserved direction are passed over.
+    Outliers are not rejected.
+
+    Estimates with an unobserved direction are ignored.
 
     .. math:: C = \Big( \sum_k C_k^{-1} \Big)^{-1}, \qquad c = C \sum_k C_k^{-1} c_k
 
     Returns
     -------
     center, covariance : ndarray, shapes (d,) and (d, d)
-        m and m².
+        Center, m, and covariance, m².
     """
     usable = [e for e in estimates if len(e.unseen) == 0]
     information = [np.linalg.inv(e.covariance) for e in usable]

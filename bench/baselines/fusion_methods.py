@@ -1,7 +1,7 @@
 """All methods that fuse the sensors of a knee, by name.
 
-Invariant: every method is fitted to the same frames and uses the same sensors. All belong to the
-program except ``linear``, a ridge regression that serves as a baseline.
+Invariant: every method is fitted to the same frames and uses the same sensors. All methods are part
+of the program, except ``linear``, a ridge regression that serves as a baseline.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     Predict = Callable[[KneeTrial], tuple[Array, Array]]
 
 METHODS = ("single", "mean", "markley", "patent6", "patent12", "linear", "anchored")
-"""``anchored`` is the default of the program."""
+"""Names of the methods. ``anchored`` is the default of the program."""
 
 
 class SegmentInputs(NamedTuple):
@@ -60,7 +60,7 @@ def models(trials: Sequence[KneeTrial], method: str = "anchored") -> tuple[Segme
 
 
 def correlation(trials: Sequence[KneeTrial]) -> float:
-    """Return the correlation of the default method's errors of thigh and shank about x."""
+    """Return the correlation between the default method's errors of thigh and shank about x."""
     return error_correlation(*_training(trials))
 
 

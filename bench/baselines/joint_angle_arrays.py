@@ -1,4 +1,4 @@
-"""Joint angles of many frames at once: the reference for those that the daemon reads one by one."""
+"""Joint angles of many frames at once, the reference for the daemon's angles of single frames."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class AngleSequence(NamedTuple):
     angles: Array
     """Joint angles, rad, shape (..., 3)."""
     gimbal: NDArray[np.bool_]
-    """Where the first and last angle are not separable, shape (...)."""
+    """Whether the first and last angle are not separable, shape (...)."""
 
 
 def patent_angles(q_joint: ArrayLike) -> AngleSequence:
@@ -33,7 +33,7 @@ def patent_angles(q_joint: ArrayLike) -> AngleSequence:
               \beta = \arcsin 2(q_0 q_2 - q_3 q_1),\;
               \gamma = \mathrm{atan2}(2(q_0 q_3 + q_1 q_2), 1 - 2(q_2^2 + q_3^2))
 
-    One frame of plain tuples: ``read_patent``.
+    The function ``read_patent`` processes one frame of plain tuples.
     """
     w, x, y, z = np.moveaxis(np.asarray(q_joint, dtype=np.float64), -1, 0)
     alpha = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
@@ -47,7 +47,8 @@ def grood_suntay(q_joint: ArrayLike) -> AngleSequence:
     .. math:: \phi = \mathrm{atan2}(-R_{12}, R_{22}),\; \theta = \arcsin R_{02},\;
               \psi = \mathrm{atan2}(-R_{01}, R_{00})
 
-    Source: Grood and Suntay 1983, doi 10.1115/1.3138397, in our axes; unsigned by side.
+    Source: Grood and Suntay 1983, doi 10.1115/1.3138397, in the axes of this project. Signs do not
+    depend on the side.
     """
     w, x, y, z = np.moveaxis(np.asarray(q_joint, dtype=np.float64), -1, 0)
     phi = np.arctan2(2 * (w * x - y * z), 1 - 2 * (x * x + y * y))
@@ -59,7 +60,7 @@ def _sequence(first: Array, sine: Array, last: Array, *, locked: Array) -> Angle
     gimbal = np.abs(sine) > GIMBAL_SINE
     first = np.where(gimbal, _wrapped(locked), first)
     last = np.where(gimbal, 0.0, last)
-    middle = np.arcsin(np.clip(sine, -1.0, 1.0))  # rounding gives 1 + 1e-16, and that NaN
+    middle = np.arcsin(np.clip(sine, -1.0, 1.0))  # rounding can yield 1 + 1e-16, and then NaN
     return AngleSequence(np.stack((first, middle, last), axis=-1), gimbal)
 
 
@@ -69,11 +70,12 @@ def anatomical(angles: ArrayLike, *, flexion_sign: float, left: bool) -> Array:
     Parameters
     ----------
     angles : array_like, shape (..., 3)
-        phi, theta, psi.
+        Angles phi, theta and psi, rad.
     flexion_sign : float
-        +1 for hip and ankle, -1 for the knee, where flexion moves the heel back.
+        +1 for hip and ankle, -1 for the knee, whose flexion moves the heel back.
     left : bool
-        Left limb: adduction and rotation change sign, so that both sides agree.
+        Whether the limb is a left limb. Adduction and rotation then change sign, so both sides
+        agree.
     """
     side = -1.0 if left else 1.0
     return np.multiply(np.asarray(angles, dtype=np.float64), [flexion_sign, side, side])
@@ -82,8 +84,8 @@ def anatomical(angles: ArrayLike, *, flexion_sign: float, left: bool) -> Array:
 def included_angle(q_joint: ArrayLike) -> Array:
     """Return the angle between the two bone axes, rad in [0, pi], shape (...); 0 when straight.
 
-    It does not depend on the choice of the flexion axis. The inner angle of the joint is pi minus
-    this.
+    The angle does not depend on the choice of the flexion axis. The inner angle of the joint is pi
+    minus this angle.
     """
     turned = rotation.rotate(q_joint, _DOWN)
     sine = np.hypot(turned[..., 0], turned[..., 1])

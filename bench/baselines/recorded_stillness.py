@@ -1,7 +1,7 @@
-"""Detection of rest in recordings, from angular rates or orientations over centered windows.
+"""Detection of rest in recordings, from angular rates or orientations in centered windows.
 
-Only variances and relative rotations are used, so a constant gyro bias or an arbitrary heading has
-no influence.
+Only variances and relative rotations are used, so a constant gyroscope bias or an arbitrary heading
+has no influence.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class RecordedStillnessLimits:
-    """Thresholds of rest. For a noisier sensor use three times its values on a table."""
+    """Thresholds of rest. For a noisier sensor, use three times its values at rest on a table."""
 
     window_s: float = 1.0
-    """Length of the window that must be at rest, s."""
+    """Duration of the window that must be at rest, s."""
     shortest_s: float = 1.5
-    """Shorter periods of rest are ignored, s."""
+    """Minimum duration of rest, s. Shorter periods are ignored."""
     gyr: float = np.deg2rad(1.0)
-    """Root of the summed variances of the three rates, rad/s."""
+    """Limit for the root of the summed variances of the three rates, rad/s."""
     acc: float = 0.15
-    """Root of the summed variances of the three specific forces, m/s^2."""
+    """Limit for the root of the summed variances of the three specific forces, m/s^2."""
     turn: float = np.deg2rad(1.0)
     """Largest rotation from the first step of a window to any later step, rad."""
     step_s: float = 0.05
@@ -40,7 +40,7 @@ class RecordedStillnessLimits:
 def still_from_rates(
     gyr: ArrayLike, acc: ArrayLike, rate_hz: float, limits: RecordedStillnessLimits | None = None
 ) -> Mask:
-    """Return the samples at rest, from raw data over centered windows.
+    """Return whether each sample is at rest, from raw data in centered windows.
 
     A sample is a candidate if the root of the summed variances over its window is below both
     limits. Runs of candidates shorter than ``shortest_s`` are dropped.
@@ -67,24 +67,24 @@ def still_from_rates(
 def still_from_orientation(
     q_world_sensor: ArrayLike, rate_hz: float, limits: RecordedStillnessLimits | None = None
 ) -> Mask:
-    """Return the samples at rest, from orientations only.
+    """Return whether each sample is at rest, from orientations only.
 
-    A window is at rest if the rotation from its first 0.05 s step to every later one is below the
-    limit. The center of the window is then a candidate, and runs shorter than ``shortest_s`` are
-    dropped. A step is the mean of its samples, so that white noise of a third of a degree is no
-    movement.
+    A window is at rest if the rotation from its first step (0.05 s) to every later step is below
+    the limit. The center of the window is then a candidate. Runs of candidates shorter than
+    ``shortest_s`` are dropped. A step is the mean of its samples, so white noise of a third of a
+    degree does not appear as movement.
 
     Parameters
     ----------
     q_world_sensor : array_like, shape (n, 4)
-        Evenly sampled; a window with NaN is not at rest.
+        Orientations at a constant rate. A window with NaN is not at rest.
     rate_hz : float
         Sampling rate, Hz.
 
     Returns
     -------
     ndarray of bool, shape (n,)
-        Half a window at either end has the value of the first or last complete window.
+        The first and the last half window have the value of the first or last complete window.
     """
     limits = limits or RecordedStillnessLimits()
     q = rotation.continuous(q_world_sensor)
@@ -96,7 +96,7 @@ def still_from_orientation(
     if starts <= 0:
         return np.zeros(count, dtype=bool)
 
-    # Rotation from the first step of every window to each of its later steps.
+    # Compute the rotation from the first step of every window to each of its later steps.
     calm = np.ones(starts, dtype=bool)
     for later in range(step, size + 1, step):
         turned = rotation.angle_between(q[:starts], q[later : later + starts])
@@ -108,7 +108,7 @@ def still_from_orientation(
 
 
 def _step_means(q: NDArray[np.float64], step: int) -> NDArray[np.float64]:
-    """Return the normalized mean of every `step` successive rows; `step` - 1 rows fewer."""
+    """Return the normalized mean of every `step` successive rows, `step` - 1 rows fewer."""
     count = max(0, len(q) - step + 1)
     total = np.zeros((count, 4))
     for offset in range(step):
@@ -118,16 +118,16 @@ def _step_means(q: NDArray[np.float64], step: int) -> NDArray[np.float64]:
 
 def _moving_spread(samples: ArrayLike, size: int) -> NDArray[np.float64]:
     values = np.array(samples, dtype=np.float64)
-    values -= values.mean(axis=0)  # variances about a large offset would lose digits
+    values -= values.mean(axis=0)  # a large offset would reduce the precision
     mean, square = _moving_mean(values, size), _moving_mean(values**2, size)
     spread: NDArray[np.float64] = np.sqrt(np.maximum(square - mean**2, 0.0).sum(axis=1))
     return spread
 
 
 def _moving_mean(values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Return the means over windows of `size` rows about each row; end rows are repeated beyond.
+    """Return the means of `size` rows centered at each row; the end rows are repeated.
 
-    Running sums instead of a scipy filter: importing scipy would double the start time of the
+    Running sums replace a scipy filter, because importing scipy would double the start time of the
     daemon.
     """
     before = size // 2

@@ -1,7 +1,7 @@
 # ruff: noqa: N806 - matrices have capital names
 r"""Recursive least squares with forgetting, compared with its batch form.
 
-Every update costs O(1). With a forgetting factor of 1 the result equals the batch fit; a factor of
+Every update costs O(1). With a forgetting factor of 1, the result equals the batch fit. A factor of
 :math:`\mu = e^{-\Delta t/\tau}` averages over about tau seconds.
 """
 
@@ -17,10 +17,11 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 EXCITATION = 1e-3
-"""Samples with g^T P g below this value do not excite the fit, and forgetting would only inflate P.
+"""Threshold of g^T P g. A sample below it does not excite the fit, and forgetting would only
+increase P.
 """
 IDLE_SAMPLES = 100
-"""Interval at which such samples are used anyway: about one a second at 100 Hz."""
+"""Number of such samples of which one is used in any case: about one per second at 100 Hz."""
 SYMMETRIZE_EVERY = 1000
 
 
@@ -31,17 +32,17 @@ class RecursiveLeastSquares:
               \Theta \leftarrow \Theta + K (y^T - g^T \Theta),\quad
               P \leftarrow (P - K g^T P) / \mu, \qquad P_0 = I / \lambda_0
 
-    Two guards prevent wind-up: most samples without excitation are skipped, and tr P never exceeds
-    its initial value.
+    Two measures prevent wind-up. Most samples without excitation are skipped, and tr P never
+    exceeds its initial value.
 
     Parameters
     ----------
     regressors, targets : int
-        p and m: Theta has shape (p, m).
+        Numbers p and m. Theta has the shape (p, m).
     ridge : float
         lambda_0, the weight of the prior Theta = 0.
     forgetting : float
-        mu in (0, 1]; with 1 there is no forgetting, and no sample is skipped.
+        mu in (0, 1]. With 1, there is no forgetting, and no sample is skipped.
     """
 
     def __init__(
@@ -81,7 +82,7 @@ class RecursiveLeastSquares:
 
 
 class InformationForm:
-    r"""Least squares from accumulated sums; the coefficients are solved for on demand.
+    r"""Least squares from accumulated sums; the coefficients are computed on demand.
 
     .. math:: A \leftarrow \mu A + w g g^T,\quad B \leftarrow \mu B + w g y^T,\quad
               \Theta = A^{-1} B
@@ -102,5 +103,5 @@ class InformationForm:
 
     @property
     def coefficients(self) -> Array:
-        """Theta, shape (p, m)."""
+        """Coefficients Theta, shape (p, m)."""
         return np.asarray(np.linalg.solve(self._A, self._B), dtype=np.float64)

@@ -1,1 +1,1 @@
-"""One package a topic; a module lists its experiments in ``EXPERIMENTS``."""
+"""Experiments, in one package per topic; a module lists its experiments in ``EXPERIMENTS``."""

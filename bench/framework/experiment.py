@@ -1,8 +1,8 @@
 """Experiments and their results.
 
-A module of ``bench.experiments`` lists its experiments in a tuple ``EXPERIMENTS``. Experiments draw
-from seeded generators and read recordings, which lie beside the checkout and are never part of it.
-An experiment whose recordings or packages are missing is skipped with the reason.
+A module of ``bench.experiments`` lists its experiments in a tuple ``EXPERIMENTS``. Experiments use
+seeded random generators and read recordings. The recordings are next to the checkout and never part
+of it. If recordings or packages of an experiment are missing, it is skipped with the reason.
 """
 
 from __future__ import annotations
@@ -23,31 +23,32 @@ if TYPE_CHECKING:
     from bench.framework.material import Material
 
 ALLOWED_SLOWDOWN = 4.0
-"""Factor by which tests, which share the machine, may exceed the threshold of a time."""
+"""Factor by which a time may exceed its threshold in tests, because tests share the machine."""
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 """Folder of the recordings."""
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """One measured number, the thresholds that it must keep and the target it should reach."""
+    """One measured number, with its thresholds and its target."""
 
     name: str
     value: float
     maximum: float = inf
-    """Threshold: a larger value fails the experiment."""
+    """Upper threshold. With a larger value, the experiment fails."""
     minimum: float = -inf
-    """Threshold: a smaller value fails the experiment."""
+    """Lower threshold. With a smaller value, the experiment fails."""
     unit: str = "deg"
     target: float | None = None
-    """Wanted upper limit of a time or a size; missing it is reported and fails nothing."""
+    """Desired upper limit of a time or a size. A missed target is reported, but the experiment does
+    not fail."""
     ratio: float | None = None
-    """CPU time over that of a fixed loop of plain Python in the same run."""
+    """Ratio of the CPU time to that of a fixed loop of plain Python in the same run."""
     note: str = ""
 
     @property
     def met(self) -> bool:
-        """Return whether the value is within its thresholds; NaN is not."""
+        """Return whether the value is within its thresholds; False for NaN."""
         return self.minimum <= self.value <= self.maximum
 
     @property
@@ -66,31 +67,34 @@ class Experiment:
     """A deterministic measurement with thresholds, or a measurement of time."""
 
     id: str
-    """Lower-case words joined by hyphens."""
+    """Identifier of lower-case words, joined by hyphens."""
     title: str
     run: Callable[[Path], list[Result]]
-    """Function that measures, given the folder of recordings."""
+    """Function that measures; its argument is the folder of recordings."""
     material: Material
     """Subjects and reference of the experiment."""
     recordings: tuple[str, ...] = ()
-    """Folders of recordings that are read."""
+    """Folders of recordings that the experiment reads."""
     packages: tuple[str, ...] = ()
-    """Packages that must be installed beside the project."""
+    """Packages that must be installed in addition to the project."""
     long: bool = False
-    """Takes longer than a test may. Only `make bench-full` runs it, unless it is a headline."""
+    """Whether the experiment is too long for a test. Only `make bench-full` runs it, unless it is a
+    headline."""
     headline: bool = False
-    """Result of docs/accuracy.md, part of `make bench` although it is long."""
+    """Whether docs/accuracy.md contains the result. `make bench` then runs the experiment even if
+    it is long."""
     timed: bool = False
-    """Measures times of this machine: tests allow `ALLOWED_SLOWDOWN`."""
+    """Whether the experiment measures times of this machine. Tests then allow `ALLOWED_SLOWDOWN`.
+    """
     quick_run: Callable[[Path], list[Result]] | None = None
-    """Shorter form for `make bench`, whose results are compared with thresholds but not stored."""
+    """Shorter variant for `make bench`. Its results are compared with thresholds but not stored."""
     known_misses: Mapping[str, str] = field(default_factory=dict)
-    """Reasons of results that miss their threshold today, by name of the result."""
+    """Reasons why results currently miss their thresholds, by name of the result."""
 
     def unexpected(self, results: list[Result], *, shared_machine: bool = False) -> list[Result]:
-        """Return results that miss their threshold and are not known to, most important first.
+        """Return the results that unexpectedly miss their threshold, most important first.
 
-        With `shared_machine` the times of `timed` experiments may be `ALLOWED_SLOWDOWN` longer.
+        With `shared_machine`, the times of `timed` experiments may be `ALLOWED_SLOWDOWN` longer.
         """
         slack = ALLOWED_SLOWDOWN if self.timed and shared_machine else 1.0
         return [
@@ -101,7 +105,7 @@ class Experiment:
         ]
 
     def missing(self, data: Path = DATA) -> str | None:
-        """Return why the experiment cannot run here, or None if it can."""
+        """Return the reason why the experiment cannot run here; None if it can."""
         absent = [name for name in self.recordings if not (data / name).is_dir()]
         if absent:
             return f"recordings not found: {', '.join(str(data / name) for name in absent)}"

@@ -1,12 +1,12 @@
 """Exponent of a cost that grows with a size, from its marginal cost.
 
-A cost is modelled as ``fixed + unit · size^exponent``. The difference of the costs of two
-neighbouring sizes, divided by the difference of the sizes, is the marginal cost: the fixed cost
-cancels. On a ladder of sizes with equal ratios its logarithm is linear in the logarithm of the
-size, with the slope ``exponent − 1``. The slope and its confidence interval are those of ordinary
-least squares.
+A cost is modelled as ``fixed + unit · size^exponent``. The marginal cost is the difference of the
+costs of two neighbouring sizes, divided by the difference of the sizes, so the fixed cost cancels.
+If the sizes have equal ratios, the logarithm of the marginal cost is linear in the logarithm of the
+size. Its slope is ``exponent − 1``. The slope and its confidence interval are from ordinary least
+squares.
 
-Invariant: adding the same amount to all costs changes no exponent.
+Invariant: a constant that is added to all costs does not change the exponent.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Exponent(NamedTuple):
 
     value: float
     half_width: float
-    """Half of the 95 % confidence interval."""
+    """Half of the width of the 95 % confidence interval."""
 
 
 def growth_exponent(sizes: Sequence[float], costs: Sequence[float]) -> Exponent:
@@ -43,7 +43,7 @@ def growth_exponent(sizes: Sequence[float], costs: Sequence[float]) -> Exponent:
     Raises
     ------
     ValueError
-        A larger size costs no more than the one before: there is no exponent.
+        A larger size does not cost more than the previous size, so no exponent exists.
     """
     n, cost = np.asarray(sizes, dtype=np.float64), np.asarray(costs, dtype=np.float64)
     marginal = np.diff(cost) / np.diff(n)
@@ -54,7 +54,7 @@ def growth_exponent(sizes: Sequence[float], costs: Sequence[float]) -> Exponent:
 
 
 def log_slope(sizes: Sequence[float], values: Sequence[float]) -> Exponent:
-    """Return the slope of the logarithm of positive values on that of the sizes."""
+    """Return the slope of the logarithm of positive values over the logarithm of the sizes."""
     x, y = np.log(np.asarray(sizes, dtype=np.float64)), np.log(np.asarray(values, dtype=np.float64))
     x -= x.mean()
     slope = float(x @ y / (x @ x))

@@ -1,4 +1,4 @@
-"""Drawing of the growth experiments from their stored results, as SVG in two themes."""
+"""Drawing of the growth experiments from stored results, as SVG in two colour themes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CURVES = (
     ("growth-segments", "segments", "orange"),
     ("growth-markers", "markers of a segment", "green"),
 )
-"""Experiment, label and color of the curves of CPU time."""
+"""Experiment, label and color of each curve of CPU time."""
 WIDTH, HEIGHT = 760, 420
 LEFT, RIGHT = 92.0, 736.0
 COST_TOP, COST_BOTTOM = 96.0, 356.0
@@ -61,7 +61,7 @@ def growth_plot() -> str:
 
 
 def _points(name: str) -> Points:
-    """Return sizes and values of the results that are named by a size."""
+    """Return sizes and values of the results whose names are sizes."""
     results = storage.results_of(storage.load(name))
     return [
         (float(found[1]), result.value)

@@ -1,4 +1,4 @@
-"""Subjects and references shared by experiments, as printed on the generated pages."""
+"""Subjects and references of experiments, as printed on the generated pages."""
 
 from __future__ import annotations
 

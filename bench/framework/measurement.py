@@ -1,7 +1,7 @@
 """Measurement of CPU time: paired runs, medians, and ratios to a fixed loop.
 
-Invariant: a time is a median over repeats. It is also given as a ratio to a fixed loop of plain
-Python in the same run, because machines differ. The threshold is a multiple of the target, so that
+Invariant: a time is a median over repeated runs. It is also given as a ratio to a fixed loop of
+plain Python in the same run, because machines differ. The threshold is a multiple of the target, so
 only a regression exceeds it.
 """
 
@@ -34,7 +34,7 @@ def timed_result(
     ratio: float | None = None,
     note: str = "",
 ) -> Result:
-    """Return a result for a time or a size, where less is better."""
+    """Return a result for a time or a size, for which smaller values are better."""
     maximum = float("inf") if threshold is None else threshold
     return Result(name, value, maximum, unit=unit, target=target, ratio=ratio, note=note)
 
@@ -56,7 +56,7 @@ def speed_experiment(
 
 
 def fixed_loop() -> int:
-    """Fixed loop of integer arithmetic, the reference of all times."""
+    """Run a fixed loop of integer arithmetic, which is the reference of all times."""
     total = 0
     for k in range(2000):
         total = (total * 31 + k) & 0xFFFF
@@ -64,7 +64,7 @@ def fixed_loop() -> int:
 
 
 def cpu_s(work: Callable[[], object]) -> float:
-    """Return the CPU time of `work` in this thread, s, independent of other processes."""
+    """Return the CPU time of `work` in this thread, s; other processes do not affect it."""
     began = time.thread_time()
     work()
     return time.thread_time() - began
@@ -76,7 +76,7 @@ def loop_s(repeats: int = 9) -> float:
 
 
 def repeats(quick: bool) -> int:
-    """Return the number of repeats for short work."""
+    """Return the number of repetitions for short functions."""
     return 3 if quick else 25
 
 
@@ -90,12 +90,12 @@ def per_item(
     slack: float = 4.0,
     note: str = "",
 ) -> Result:
-    """Return the median CPU time per item of paired repeats; `prepare` makes new work for each."""
+    """Return the median CPU time per item; `prepare` makes a new function for each repeat."""
     prepare()()  # warm up
     times, ratios = [], []
     for _ in range(repeats(quick)):
         work = prepare()
-        gc.collect()  # garbage of earlier work must not count
+        gc.collect()  # collect the garbage of earlier functions
         loop = cpu_s(fixed_loop)
         took = cpu_s(work) / items
         times.append(took)

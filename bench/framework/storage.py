@@ -1,7 +1,7 @@
 """Results as JSON files in ``bench/results``, one per experiment.
 
 The files are committed, and the pages of docs are generated from them. They contain no date and no
-path. Values have the digits that the pages show, so that a repeated run changes times only.
+path. Values have as many digits as on the pages, so a repeated run changes times only.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 MACHINE = "machine"
-"""Name of the file that describes the machine of the times."""
+"""Name of the file that describes the machine on which times were measured."""
 
 
 def shown(value: float) -> float:
-    """Return the value with the digits of the tables: three decimals, or three digits."""
+    """Return the value rounded as in the tables: to three decimals or three digits."""
     value = float(value)
     if 0.0 < abs(value) < 0.01:
         return float(f"{value:.3g}")
@@ -32,8 +32,10 @@ def shown(value: float) -> float:
 
 
 def to_json(experiment: Experiment, results: Sequence[Result]) -> dict[str, Any]:
-    """Return experiment and results as JSON values; infinite values are strings, absent limits
-    null."""
+    """Return experiment and results as JSON values.
+
+    Infinite values become strings, and missing limits become null.
+    """
     return {
         "experiment": experiment.id,
         "topic": experiment.topic,
@@ -67,7 +69,7 @@ def to_json(experiment: Experiment, results: Sequence[Result]) -> dict[str, Any]
 
 
 def in_short_run(experiment: Experiment) -> bool:
-    """Return whether `make bench` runs the experiment at full length."""
+    """Return whether `make bench` runs the full experiment."""
     if experiment.quick_run is not None:
         return False
     return experiment.headline or not (experiment.long or experiment.timed)
@@ -82,7 +84,7 @@ def _limit(value: float) -> float | None:
 
 
 def store(name: str, content: dict[str, Any], folder: Path = RESULTS) -> Path:
-    """Write one file of `folder` and return its path."""
+    """Write one file to `folder`; return its path."""
     folder.mkdir(exist_ok=True)
     path = folder / f"{name}.json"
     path.write_text(_one_line_each(content), encoding="utf-8")
@@ -90,7 +92,7 @@ def store(name: str, content: dict[str, Any], folder: Path = RESULTS) -> Path:
 
 
 def _one_line_each(content: dict[str, Any]) -> str:
-    """Return JSON with a line for each key and for each result."""
+    """Return JSON text with one line for each key and for each result."""
     lines = []
     for key, value in content.items():
         text = json.dumps(value, ensure_ascii=False)
@@ -108,7 +110,7 @@ def load(name: str, folder: Path = RESULTS) -> dict[str, Any]:
 
 
 def results_of(content: dict[str, Any]) -> list[Result]:
-    """Return the results of a file; `to_json` of them gives the same file."""
+    """Return the results in a file; `to_json` converts them to the same content."""
     return [
         Result(
             name=entry["name"],

@@ -1,4 +1,4 @@
-"""Results as a text table and as Markdown."""
+"""Conversion of results to a text table and to Markdown."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ HEAD = ("experiment", "result", "value", "threshold", "target", "× loop", "")
 
 
 def value_text(value: float, unit: str = "") -> str:
-    """Return a value with its unit: three decimals, or three digits if it is small."""
+    """Return a value with its unit, with three decimals, or three digits if it is small."""
     text = f"{value:.3g}" if 0.0 < abs(value) < 0.01 else f"{value:.3f}"
     return f"{text} {unit}".rstrip()
 
 
 def outcome(result: Result) -> str:
-    """Return whether threshold and target were missed, and the note of the result."""
+    """Return whether threshold or target was missed, and the note of the result."""
     if not result.met:
         missed = "MISSED"
     elif result.target is not None and result.value > result.target:
@@ -30,7 +30,7 @@ def outcome(result: Result) -> str:
 
 
 def text_table(measured: Sequence[tuple[Experiment, Sequence[Result]]]) -> str:
-    """Return one line a result, in columns."""
+    """Return one line per result, in columns."""
     lines = [HEAD]
     for experiment, results in measured:
         for index, result in enumerate(results):
@@ -53,6 +53,6 @@ def text_table(measured: Sequence[tuple[Experiment, Sequence[Result]]]) -> str:
 
 
 def markdown_table(rows: Sequence[Sequence[str]]) -> str:
-    """Return a Markdown table; the first row is its head, columns after the first align right."""
+    """Return a Markdown table with a head row; columns after the first are right-aligned."""
     rule = ["---", *["--:"] * (len(rows[0]) - 1)]
     return "\n".join(f"| {' | '.join(row)} |" for row in (rows[0], rule, *rows[1:]))

@@ -1,7 +1,8 @@
 """Plots of a run: ``python -m bench.plots clocks|joint-centers FOLDER``.
 
-``clocks`` draws a simulated run with its truth, or with ``--replay RECORDING`` a recorded run, as
-the daemon writes it. ``joint-centers`` draws the recorded trials with estimated and model centers.
+The subject ``clocks`` draws a simulated run with its truth; with ``--replay RECORDING`` it draws a
+recorded run of the daemon. The subject ``joint-centers`` draws the recorded trials with estimated
+and model centers.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def draw(subject: str, folder: Path, recorded: Path | None = None) -> int:
-    """Draw one subject into `folder`, print the files and return the exit code."""
+    """Draw one subject into `folder`, print the file names, and return the exit code."""
     if find_spec("matplotlib") is None:
         print("matplotlib is not installed: pip install 'jointfitd[plot]'", file=sys.stderr)
         return 2

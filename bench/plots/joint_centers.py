@@ -1,7 +1,8 @@
-"""Plots of recorded trials: marker paths, estimated centers, centers of the models.
+"""Plots of recorded trials: marker paths, estimated centers, and centers of the models.
 
-Two views of every joint in parent coordinates, across the main axis of rotation and along it, with
-equal scales. Rejected estimates are drawn faint, with the reason.
+The plots show two views of every joint in parent coordinates, perpendicular to the main axis of
+rotation and along it, with equal scales. Rejected estimates are drawn in a light colour, with the
+reason.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ def _title(found: EstimatedCenters) -> str:
 def _panel(
     axes: Any, found: EstimatedCenters, view: NDArray[np.float64], labels: tuple[str, str]
 ) -> None:
-    """Draw one view: `view` maps parent coordinates to those of the panel, shape (3, 2)."""
+    """Draw one view; `view` maps parent coordinates to panel coordinates, shape (3, 2)."""
     points = found.reduced.movement.points
     assert points is not None
     origin = found.model @ view

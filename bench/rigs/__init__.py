@@ -1,1 +1,1 @@
-"""The daemon, simulators and a broker as processes, and the core fed with recorded events."""
+"""The daemon, simulators and a broker as processes; the core with recorded events."""

@@ -1,7 +1,7 @@
-"""The dashboard's server and page, measured: CPU time and memory with viewers, paint and frames.
+"""Costs of the dashboard: CPU time and memory with viewers, first paint, and frame times.
 
-Invariant: server, viewers, daemon and browser are processes of their own. Rounds with and without
-viewers alternate, so that a change of the machine's load does not appear as a cost.
+Invariant: server, viewers, daemon and browser are separate processes. Rounds with and without
+viewers alternate, so a change of the machine's load does not appear as a cost.
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).resolve().parents[2]
 HOST = "127.0.0.1"
 COUNTS = (0, 1, 10)
-"""Numbers of viewers, one round after another."""
+"""Numbers of viewers in successive rounds."""
 JOIN_S, WARM_S = 30.0, 1.0
-"""Time limit for viewers to connect, and time in which the page draws its first curves, s."""
+"""Time limit for the connection of viewers, and time in which the page draws its first curves, s.
+"""
 _TRANSFER = """() => [
   performance.getEntriesByType('resource').concat(performance.getEntriesByType('navigation'))
     .reduce((sum, entry) => sum + entry.transferSize, 0),
@@ -38,13 +39,13 @@ _TRANSFER = """() => [
 
 @dataclass(slots=True)
 class ViewerCosts:
-    """Shares of a core in each round, %, and the server's memory, by number of viewers."""
+    """CPU share in each round, %, and memory of the server, by number of viewers."""
 
     daemon_pct: dict[int, list[float]] = field(default_factory=lambda: {n: [] for n in COUNTS})
     server_pct: dict[int, list[float]] = field(default_factory=lambda: {n: [] for n in COUNTS})
     server_mb: dict[int, float] = field(default_factory=dict)
     kilobytes_s: float = 0.0
-    """Bytes to each viewer, kB/s."""
+    """Data rate to each viewer, kB/s."""
 
 
 @dataclass(slots=True)
@@ -53,17 +54,17 @@ class PageCosts:
 
     transferred_kb: float
     paint_ms: list[float]
-    """First contentful paint of pages in new windows."""
+    """Time of the first contentful paint of a page in a new window, ms."""
     limb_ms: list[float]
-    """Main-thread time of each frame of the limb."""
+    """Main-thread time of each frame of the limb, ms."""
     curve_ms: list[float]
     seconds: float
-    """Time in which the frames were drawn."""
+    """Time in which the frames were drawn, s."""
 
 
 @asynccontextmanager
 async def dashboard_server(port: int) -> AsyncIterator[tuple[asyncio.subprocess.Process, str]]:
-    """Run `jointfit dashboard` at a broker; yield the process and the URL of the page."""
+    """Run `jointfit dashboard` with a broker; yield the process and the URL of the page."""
     process = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "jointfit_daemon.tools.__main__", "dashboard",
         "--listen", f"{HOST}:0", "--broker", f"mqtt://{HOST}:{port}",
@@ -78,7 +79,7 @@ async def dashboard_server(port: int) -> AsyncIterator[tuple[asyncio.subprocess.
 
 
 async def measure_viewers(folder: Path, port: int, rounds: int, seconds: float) -> ViewerCosts:
-    """Return the cost of viewers to a daemon with four IMUs at 100 Hz and cameras."""
+    """Return the cost of viewers for a daemon with four IMUs at 100 Hz and cameras."""
     found = ViewerCosts()
     base = f"jointfit/{folder.name}"
     async with (
@@ -100,7 +101,7 @@ async def measure_viewers(folder: Path, port: int, rounds: int, seconds: float) 
 
 @asynccontextmanager
 async def _viewers(port: int, base: str, count: int, found: ViewerCosts) -> AsyncIterator[None]:
-    """Run viewers in a process of their own for the duration of the block."""
+    """Run viewers in another process during the ``async with`` block."""
     if count == 0:
         yield
         return
@@ -122,7 +123,7 @@ async def _viewers(port: int, base: str, count: int, found: ViewerCosts) -> Asyn
 
 
 async def measure_page(port: int, windows: int, seconds: float) -> PageCosts:
-    """Return the cost of the page on a rig that publishes ten poses a second."""
+    """Return the cost of the page for a rig that publishes ten poses per second."""
     async with (
         chromium() as browser,
         publishing(PublishedRig(), port),
@@ -144,7 +145,7 @@ async def measure_page(port: int, windows: int, seconds: float) -> PageCosts:
 
 
 async def _load(browser: Browser, url: str) -> tuple[float, float]:
-    """Return the bytes transferred to a new window, and the time of its first paint, ms."""
+    """Return the bytes that a new window receives, and the time of its first paint, ms."""
     async with opened(browser, url) as page:
         await page.until_text("#angle-value", "°")
         await asyncio.sleep(WARM_S)

@@ -1,9 +1,9 @@
 """Viewers of the dashboard: `python -m bench.rigs.dashboard_viewers PORT BASE COUNT`.
 
 Invariant: each viewer subscribes to the topics of the page through the tunnel of the dashboard's
-server, like a browser, and reads every message. The process prints a line once all viewers have
-received poses. It ends when its input is closed, and prints the bytes that the viewer with the
-fewest received since.
+server, like a browser, and reads every message. The process prints a line when all viewers have
+received poses. It ends when its input is closed. It then prints the smallest number of bytes that a
+viewer has received since.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ TOPICS = (
     "bridge/state", "bridge/info", "bridge/health", "bridge/event", "bridge/response/#",
     "calibration", "calibration/progress", "device/+/+", "pose/ui", "optical/pose",
 )  # fmt: skip
-"""Topics below the base that the page subscribes to."""
+"""Topics, relative to the base topic, to which the page subscribes."""
 
 
 def packet(kind: int, content: bytes) -> bytes:
-    """Return an MQTT packet; its length has one or two bytes."""
+    """Return an MQTT packet, whose length field has one or two bytes."""
     length = len(content)
     size = bytes([length]) if length < 128 else bytes([length % 128 | 128, length // 128])
     return bytes([kind]) + size + content
 
 
 def text(value: str) -> bytes:
-    """Return a string of MQTT: its length, then UTF-8."""
+    """Return an MQTT string, which is its length followed by UTF-8 bytes."""
     return len(value.encode()).to_bytes(2) + value.encode()
 
 
@@ -51,7 +51,7 @@ async def view(port: int, base: str, received: list[int], number: int) -> None:
 
 
 async def run(port: int, base: str, count: int) -> int:
-    """Run viewers until the input is closed; return the smallest number of bytes."""
+    """Run viewers until the input is closed; return the smallest number of received bytes."""
     received = [0] * count
     tasks = [asyncio.create_task(view(port, base, received, n)) for n in range(count)]
     closed = asyncio.create_task(asyncio.to_thread(sys.stdin.read))
@@ -67,7 +67,7 @@ async def run(port: int, base: str, count: int) -> int:
 
 
 def main() -> None:
-    """Run viewers."""
+    """Run the viewers that the arguments describe."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("port", type=int)
     parser.add_argument("base")

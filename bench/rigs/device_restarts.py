@@ -1,9 +1,9 @@
-"""Live rig with drifting clocks and device restarts; the error of every stamp.
+"""Live rig with drifting clocks and device restarts, which measures the error of every stamp.
 
 Invariant: three processes exchange only bytes: simulated devices (NatNet, two IMUs on UARTs, two on
-CAN), the daemon, and a broker. Devices reboot one after the other, each once all have recovered.
-Without calibration no clock can estimate the least delay of its transport, so the simulator's value
-is subtracted.
+CAN), the daemon, and a broker. The devices reboot one after another, each after all devices have
+recovered. Without calibration, no clock can estimate the minimum delay of its transport, so the
+simulator's value is subtracted.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 SKEWS_PPM = {"S1": 50, "S2": -50, "S3": 31, "S4": -23, OPTICAL: 42}
 DELAY_MS = {"S1": 2.0, "S2": 1.0, "S3": 2.0, "S4": 1.0}
-"""Least delay of the simulated transports, ms; cameras answer echoes and need none."""
+"""Minimum delay of the simulated transports, ms. Cameras answer echoes and need no value."""
 EVERY = {*SENSORS, OPTICAL}
 PATIENCE_S = 40.0
-"""Time limit for a step that takes three seconds on an idle machine, s."""
+"""Time limit for a step, s. On an idle machine, a step takes three seconds."""
 
 
 class RestartRun(NamedTuple):
@@ -32,10 +32,10 @@ class RestartRun(NamedTuple):
 
     core: ObservedCore
     replayed: bool
-    """The recording replays to byte-identical limb states."""
+    """Whether the replay of the recording yields byte-identical limb states."""
 
     def errors_ns(self, source: str, method: str = "") -> list[int]:
-        """Return the errors of all synced stamps of a source, optionally of one method only."""
+        """Return the errors of all synced stamps of a source, or of one of its clock methods."""
         return [
             sample.error_ns
             for sample in self.core.samples
@@ -46,7 +46,7 @@ class RestartRun(NamedTuple):
         ]
 
     def unexcused_ns(self, source: str) -> list[int]:
-        """Return the part of those errors that delays of a loaded machine do not explain."""
+        """Return the part of these errors that delays of a loaded machine do not explain, ns."""
         return [
             unexcused(sample.error_ns, sample.excused_ns)
             for sample in self.core.samples
@@ -55,18 +55,18 @@ class RestartRun(NamedTuple):
 
     @property
     def unknown(self) -> float:
-        """Share of samples that the simulator did not record."""
+        """Share of samples that are not in the simulator's log."""
         samples = self.core.samples
         return sum(sample.error_ns is None for sample in samples) / max(1, len(samples))
 
     @property
     def frame_errors_ns(self) -> list[float]:
-        """Largest error of each synced frame."""
+        """Return the largest error of each synced frame, ns."""
         return [frame.worst_ns for frame in self.core.frames if frame.synced]
 
 
 def locked(listener: Listener) -> bool:
-    """Return whether the newest pose is synced and no clock is settling."""
+    """Return whether the newest pose is synced and all clocks have converged."""
     devices = listener.latest.get("bridge/health", {}).get("devices", {})
     settled = [device.get("clock") != "settling" for device in devices.values()]
     return (
@@ -78,7 +78,7 @@ def locked(listener: Listener) -> bool:
 
 
 async def recovers(listener: Listener, name: str) -> None:
-    """Wait until the loss is detected, the device is online again, and everything is synced."""
+    """Wait until the loss is detected, the device is online again, and all clocks are synced."""
     await listener.until(lambda: not locked(listener) or name not in listener.online, PATIENCE_S)
     before = listener.healths
     await listener.until(
@@ -95,13 +95,13 @@ async def live(
     Parameters
     ----------
     folder, port
-        Empty folder; port of the broker.
+        Empty folder, and port of the broker.
     reboots
-        Sensors, or `mocap`, in order.
+        Sensor ids or `mocap`, in the order of the reboots.
     rest_s
         Time without a fault before each reboot and at the end, s.
     more
-        Further options of the simulator.
+        Additional options of the simulator.
     """
     clocks = [word for name, ppm in SKEWS_PPM.items() for word in ("--clock", f"{name}={ppm}")]
     options = ("--sample-log", "--programme", "walk", *clocks, *more)

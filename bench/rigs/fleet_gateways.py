@@ -1,9 +1,10 @@
 """Simulated gateways of a fleet: `python -m bench.rigs.fleet_gateways PORT TRAFFIC COUNT`.
 
-Invariant: each gateway has a connection of its own and sends the recorded messages of one real
-daemon, at their recorded times, shifted against the other gateways. After a loss of the connection
-it connects again as the daemon does, and sends its retained messages first. The process prints a
-line when all are connected, ends when its input is closed, and prints its counts as JSON.
+Invariant: each gateway has its own connection. It sends the recorded messages of one real daemon at
+their recorded times, with a time shift relative to the other gateways. After a loss of the
+connection, it connects again as the daemon does, and sends its retained messages first. The process
+prints a line when all gateways are connected. It ends when its input is closed, and prints its
+counts as JSON.
 """
 
 from __future__ import annotations
@@ -22,28 +23,30 @@ from bench.rigs.dashboard_viewers import packet, text
 
 HOST = "127.0.0.1"
 RETRY_S = (0.3, 0.6)
-"""Wait before another attempt to connect, s, as in the daemon."""
+"""Time before another attempt to connect, s, as in the daemon."""
 SKIPPED_S = 1.0
-"""Delay beyond which a message is not sent: at the start, those before the shift of the gateway."""
+"""Delay above which a message is not sent, s. At the start, messages before the time shift of the
+gateway are thus omitted."""
 DUE_KEY = b'"completed_us":'
-"""Key of a pose whose value becomes the time of sending, so that the station can measure delays."""
+"""Key of a pose whose value is replaced by the time of sending. The station can then measure
+delays."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedMessage:
-    """A message of the daemon."""
+    """A recorded message of the daemon."""
 
     at_s: float
-    """Time since the start of the recording; 0 for a retained message."""
+    """Time since the start of the recording, s; 0 for a retained message."""
     topic: str
-    """Topic below the base."""
+    """Topic relative to the base topic."""
     payload: bytes
     retained: bool
 
 
 @dataclass(slots=True)
 class Sent:
-    """Messages that all gateways wrote to their connections."""
+    """Counts of the messages that all gateways wrote to their connections."""
 
     messages: int = 0
     octets: int = 0
@@ -60,7 +63,7 @@ def load_traffic(path: Path) -> tuple[float, list[RecordedMessage]]:
 
 
 class SimulatedGateway:
-    """One gateway."""
+    """One simulated gateway."""
 
     def __init__(self, port: int, number: int, sent: Sent) -> None:
         self._port, self._base, self._sent = port, f"jointfit/wearer-{number:02d}", sent
@@ -125,7 +128,7 @@ class SimulatedGateway:
 
 
 async def run(port: int, traffic: Path, count: int) -> Sent:
-    """Run gateways until the input is closed; return the counts of all."""
+    """Run gateways until the input is closed; return the total counts."""
     sent = Sent()
     period_s, messages = load_traffic(traffic)
     gateways = [SimulatedGateway(port, number, sent) for number in range(count)]
@@ -145,7 +148,7 @@ async def run(port: int, traffic: Path, count: int) -> Sent:
 
 
 def main() -> None:
-    """Run gateways."""
+    """Run the gateways that the arguments describe."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("port", type=int)
     parser.add_argument("traffic", type=Path)

@@ -1,7 +1,8 @@
-"""Difference of arrival stamp and sending time of datagrams while the loop of the reader is busy.
+"""Difference between arrival stamp and sending time of datagrams while the reader is busy.
 
-Invariant: the sender is a separate process and writes CLOCK_MONOTONIC into each datagram directly
-before the system call. The reader stamps with the same clock, so the difference needs no model.
+Invariant: the sender is a separate process, which writes CLOCK_MONOTONIC into each datagram
+directly before the system call. The reader stamps with the same clock, so the difference needs no
+model.
 """
 
 from __future__ import annotations
@@ -31,14 +32,14 @@ for _ in range(count):
 
 
 def delays_ns(count: int, blocked_s: float = 0.004) -> tuple[list[int], list[int]]:
-    """Return stamp minus sending and reading minus sending of every datagram, ns.
+    """Return, for every datagram, stamp minus sending time and reading minus sending time, ns.
 
     Parameters
     ----------
     count
         Number of datagrams, one every 2 ms.
     blocked_s
-        Time for which the reading loop is blocked, with short pauses in between, s.
+        Time for which the event loop of the reader is blocked, s, with short pauses in between.
     """
     return asyncio.run(_measure(count, blocked_s))
 

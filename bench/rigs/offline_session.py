@@ -1,10 +1,10 @@
-"""A session of recorded movements without bytes, clocks, load or messages: fit and fusion offline.
+"""Session of recorded movements with offline fit and fusion, without bytes, clocks or messages.
 
-Invariant: nothing is taken from the daemon except the instants of its frames. The sensors have
-their recorded orientation at exactly these instants, the models are fitted as `jointfit fuse fit`
-does, and the sensors are fused frame by frame as `jointfit fuse apply` does, including the
-correction of headings and pairs. The session includes the time at rest before the movement, from
-which the daemon knows the headings, and the gaps of the recording.
+Invariant: only the times of the frames are from the daemon. The sensors have their recorded
+orientations at exactly these times. The models are fitted as `jointfit fuse fit` does. The sensors
+are fused frame by frame as `jointfit fuse apply` does, including the correction of headings and
+pairs. The session includes the rest before the movement, from which the daemon determines the
+headings, and the gaps of the recording.
 """
 
 from __future__ import annotations
@@ -53,18 +53,18 @@ def fuse_session(
     calibration: Calibration,
     transition_s: float,
 ) -> Mapping[int, LimbState]:
-    """Return the limb states of a session by instant.
+    """Return the limb states of a session by time, ns.
 
     Parameters
     ----------
     files : sequence of path
-        The recording.
+        Files of the recording.
     truth : path
-        Ground-truth log of the simulator, with the motions of the session.
+        Log of the simulator with the ground truth and the motions of the session.
     t_ns : sequence of int
-        Instants of the frames at equal intervals, ns.
+        Times of the frames at equal intervals, ns.
     calibration : Calibration
-        Calibration in use from the first instant on.
+        Active calibration from the first frame on.
     transition_s : float
         Duration of the blend between motions, s.
     """

@@ -1,7 +1,7 @@
-"""Recordings of the simulated leg, made by the daemon in real time.
+"""Recordings of the simulated leg, which the daemon makes in real time.
 
-Invariant: the processes are those of a user: ``jointfit-sim``, jointfitd with ``[recording]`` and a
-broker. The leg has four IMUs of 100 Hz and cameras of 100 frames a second.
+Invariant: the processes are the same as for a user: ``jointfit-sim``, jointfitd with
+``[recording]``, and a broker. The leg has four IMUs at 100 Hz and cameras at 100 frames per second.
 """
 
 from __future__ import annotations
@@ -25,12 +25,13 @@ KINDS: dict[Kind, tuple[str, tuple[str, ...]]] = {
     "imus": ("IMUs, calibrated before", ("--no-mocap",)),
     "chain": ("IMUs and cameras with chain model", ("--chain-model",)),
 }
-"""Text and options of ``jointfit-sim`` of each recording; `imus` uses the result of `cameras`."""
+"""Text of each recording, and options of ``jointfit-sim``. The recording `imus` uses the result of
+`cameras`."""
 MOTIONS, MOTION_S = ("walk", "squat", "sit_to_stand"), 10.0
 
 
 def record_leg(folder: Path, seconds: float) -> dict[Kind, Path]:
-    """Return the folders of new recordings below `folder`, `seconds` after the calibration."""
+    """Make recordings of `seconds` after the calibration; return their folders below `folder`."""
     broker = chosen_broker()(folder)
     broker.start()
     try:

@@ -1,10 +1,10 @@
-"""A process that records four sensors of 400 Hz and the limb states of 100 Hz, until it is killed.
+"""Process that records four sensors at 400 Hz and limb states at 100 Hz, until it is killed.
 
     python -m bench.rigs.recording_process FOLDER [--seconds S] [--file-seconds S] [--stamps]
         [--without-recorder]
 
-It writes ``ready`` when it starts to feed, and its cost as JSON at its end; with ``--stamps`` also
-the arrival of the last chunk, CLOCK_MONOTONIC ns, ten times a second.
+It prints ``ready`` when the input starts, and its cost as JSON at its end. With ``--stamps``, it
+also prints the arrival time of the last chunk ten times per second, CLOCK_MONOTONIC ns.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from tests.pipeline.core_feed import SENSORS, chunk, opening
 
 RATE_HZ, STATES_HZ = 400, 100
 PERIOD_S = 0.01
-"""Interval between feeds, s: four samples of each sensor, and one state."""
+"""Time between two inputs, s. Each input has four samples of each sensor and one state."""
 STAMP_FEEDS = 10
-"""Feeds between two printed stamps."""
+"""Number of inputs between two printed stamps."""
 PREPARED = 400
-"""Samples of each sensor that are prepared; they are repeated."""
+"""Number of prepared samples of each sensor, which are repeated."""
 
 
 def prepared_chunks() -> list[list[tuple[str, bytes]]]:
@@ -38,7 +38,7 @@ def prepared_chunks() -> list[list[tuple[str, bytes]]]:
 
 
 def prepared_states() -> list[LimbState]:
-    """Return limb states of a core that is fed with these samples."""
+    """Return the limb states of a core that processes these samples."""
     core, states = Core(), []
     for event in opening(mocap=False):
         core.feed(event)
@@ -49,13 +49,13 @@ def prepared_states() -> list[LimbState]:
 
 
 def peak_memory_kib() -> int:
-    """Return the peak of the resident memory, KiB; getrusage includes that of the parent."""
+    """Return the peak resident memory, KiB; getrusage would include the parent's memory."""
     status = Path("/proc/self/status").read_text(encoding="ascii")
     return int(status.partition("VmHWM:")[2].split()[0])
 
 
 async def record(options: argparse.Namespace) -> None:
-    """Feed the recorder in real time, and print the cost."""
+    """Send the input to the recorder in real time, and print the cost."""
     samples, states = prepared_chunks(), prepared_states()
     limits = RecordingLimits(file_s=options.file_seconds)
     recorder = Recorder(options.folder, "rig", limits, autostart=False)

@@ -1,7 +1,7 @@
 """Malformed and oversized requests at 1 kHz: `python -m bench.rigs.request_flood PORT BASE`.
 
-Invariant: none of them is a valid request. The process is one MQTT 5 client, like an attacker, and
-prints the number of requests sent and the time taken.
+Invariant: no request is valid. The process is one MQTT 5 client, like an attacker. It prints the
+number of sent requests and the time taken.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from paho.mqtt.properties import Properties
 
 RATE_HZ, SECONDS = 1000, 10.0
 _TURN_S = 0.005
-"""Interval whose requests are sent in one burst."""
+"""Time whose requests are sent in one burst, s."""
 
 
-_Properties: Any = Properties  # its constructor has no annotations
+_Properties: Any = Properties  # the constructor has no annotations
 
 
 def _properties(**values: Any) -> Any:
@@ -33,7 +33,7 @@ def _properties(**values: Any) -> Any:
 
 
 def kinds(base: str) -> list[tuple[str, bytes, Any]]:
-    """Return topic, payload and properties of each kind of invalid request."""
+    """Return topic, payload and properties of each type of invalid request."""
     root = f"{base}/bridge/request"
     topic = f"{root}/calibrate"
     return [
@@ -56,7 +56,7 @@ def kinds(base: str) -> list[tuple[str, bytes, Any]]:
 
 
 def main() -> None:
-    """Connect, send all requests at an even rate, wait for the acknowledgements, report."""
+    """Connect, send all requests at a constant rate, wait for acknowledgements, and report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("port", type=int)
     parser.add_argument("base")
@@ -72,7 +72,7 @@ def main() -> None:
     ):
         if (early := began + number / RATE_HZ - time.monotonic()) > _TURN_S:
             time.sleep(early)
-        # The number of kinds is odd, so each is sent at both QoS levels.
+        # The number of types is odd, so each type is sent at both QoS levels.
         client.publish(topic, payload, number % 2, properties=properties)
     client.publish(f"{options.base}/bridge/request/last", b"[]", 1).wait_for_publish(SECONDS)
     print(json.dumps({"sent": count, "seconds": time.monotonic() - began}))

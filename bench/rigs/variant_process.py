@@ -1,8 +1,8 @@
-"""A process that measures parts of the frame's path on its own variant of the modules.
+"""Process that measures parts of the frame's path with one variant of the modules.
 
-It prints its variant, and reads a calibration as a line of JSON. For each name of a part that it
-reads then, it prints a line of JSON: median CPU time of an item, µs, by name of the measurement. It
-is a process of its own because the first import chooses the variant.
+The process prints its variant, and reads a calibration as a line of JSON. Then it reads names of
+parts. For each name, it prints a line of JSON with the median CPU time per item, µs, by
+measurement. A separate process is necessary because the first import selects the variant.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ PARTS: dict[str, Callable[[bool], list[Result]]] = {
 
 
 def main() -> None:
-    """Answer until standard input ends."""
+    """Process the input until standard input ends."""
     print(running_variant(), flush=True)
     calibration = Calibration.from_dict(json.loads(sys.stdin.readline()))
-    with patch.object(core, "worn", return_value=calibration):  # a fit takes longer than all parts
+    with patch.object(core, "worn", return_value=calibration):  # a fit would take long
         for line in sys.stdin:
             results = PARTS[line.strip()](True)
             print(json.dumps({result.name: result.value for result in results}), flush=True)

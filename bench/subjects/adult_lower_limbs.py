@@ -1,8 +1,8 @@
-"""Lower limbs of one recorded adult as a chain: seven segments, 20 degrees of freedom.
+"""Lower limbs of one recorded adult as a chain with seven segments and 20 degrees of freedom.
 
-Built from the standing trial alone. Joint centers lie between the markers on either side of a
-joint; the hip center is the computed one of the recording. Axes follow from the centers, and
-markers have their positions in stance. Virtual markers are not tracked.
+The chain is built from the standing trial alone. Joint centers are between the markers on both
+sides of a joint, except the hip center, which the recording contains. Axes follow from the centers,
+and markers have their positions in stance. Virtual markers are not tracked.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ def trial(data: Path, name: str) -> MarkerTrial:
 
 
 def measured(data: Path, name: str, model: ChainModel) -> Array:
-    """Return the model's markers in a trial, m, shape (T, M, 3)."""
+    """Return the positions of the model's markers in a trial, m, shape (T, M, 3)."""
     return trial(data, name).points(model.marker_names)
 
 
 @cache
 def oc4_lower(data: Path) -> ChainModel:
-    """Return the chain."""
+    """Return the chain model."""
     static = trial(data, "static1")
     names = static.trajectories.names
     means = np.nanmean(static.trajectories.positions, axis=0)

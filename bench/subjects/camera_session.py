@@ -1,6 +1,7 @@
-"""Input events of a core during a walk: four IMUs of 100 Hz, and cameras of 100 frames a second.
+"""Input events of a core during a walk, from four IMUs at 100 Hz and cameras at 100 Hz.
 
-Invariant: deterministic, without clock and processes; events are in order of arrival.
+Invariant: the events are deterministic and in order of arrival. The module uses no clock and no
+processes.
 """
 
 from __future__ import annotations
@@ -23,16 +24,16 @@ CAMERA_NS = 10_000_000
 def session_events(
     seconds: float, *, cameras: bool = True, silent: tuple[str, float, float] | None = None
 ) -> list[Event]:
-    """Return the events of a calibrated rig, with a tick a second.
+    """Return the events of a calibrated rig, with one tick per second.
 
     Parameters
     ----------
     seconds : float
-        Length of the session, s.
+        Duration of the session, s.
     cameras : bool
         Whether the motion-capture server sends.
     silent : tuple of str and two floats, optional
-        A sensor without data, from and to, s.
+        A sensor without data, and start and end of this period, s.
     """
     frames: list[Event] = []
     opening: list[Event] = [Configured(START_NS, bench_rig(), worn(), 1)]

@@ -1,4 +1,4 @@
-"""Bytes of simulated devices, made by the project's encoders before the measurement.
+"""Bytes of simulated devices, which the project's encoders make before the measurement.
 
 Invariant: every function is deterministic and returns chunks in order of arrival.
 """
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 
 NS = 1_000_000_000
 TICK_NS = 100_000
-"""Sample time fine of an MTi."""
+"""Tick of the item SampleTimeFine of an MTi, ns."""
 BITSTREAM = (3, 1)
 _SERVER = ServerInfo("Motive", (2, 3, 0, 0), (3, 1, 0, 0), 10_000_000)
 
 
 def xbus_message(number: int, ticks: int, q: Quaternion) -> bytes:
-    """Counter, time, status and quaternion: the outputs of a configured MTi."""
+    """Return a message with counter, time, status and quaternion, as a configured MTi sends it."""
     return xbus.encode(
         xbus.XbusMessageId.MT_DATA2,
         mtdata2.encode_items(
@@ -49,14 +49,14 @@ def xbus_message(number: int, ticks: int, q: Quaternion) -> bytes:
 
 
 def xbus_messages(orientations: Sequence[Quaternion], period_ns: int) -> list[bytes]:
-    """One message per sample."""
+    """Return one message per sample."""
     return [xbus_message(k, k * period_ns // TICK_NS, q) for k, q in enumerate(orientations)]
 
 
 def xcdi_frames(
     orientations: Sequence[Quaternion], period_ns: int, ids: xcdi.XcdiIds, start_ns: int = 0
 ) -> list[list[CanFrame]]:
-    """Three frames per sample: time, counter, quaternion."""
+    """Return three frames per sample: time, counter and quaternion."""
     return [
         [
             CanFrame(start_ns + k * period_ns, can_id, xcdi.encode(data_id, counts))
@@ -74,7 +74,7 @@ def xcdi_frames(
 def xbus_chunks(
     orientations: Sequence[Quaternion], period_ns: int, start_ns: int = 0
 ) -> list[Chunk]:
-    """One chunk per sample."""
+    """Return one chunk per sample."""
     messages = xbus_messages(orientations, period_ns)
     return [Chunk(start_ns + k * period_ns, data) for k, data in enumerate(messages)]
 
@@ -82,33 +82,33 @@ def xbus_chunks(
 def xcdi_chunks(
     orientations: Sequence[Quaternion], period_ns: int, ids: xcdi.XcdiIds, start_ns: int = 0
 ) -> list[Chunk]:
-    """One chunk of three records per sample."""
+    """Return one chunk of three frames per sample."""
     groups = xcdi_frames(orientations, period_ns, ids, start_ns)
     return [Chunk(start_ns + k * period_ns, pack_frames(group)) for k, group in enumerate(groups)]
 
 
 def slcan_lines(groups: Sequence[Sequence[CanFrame]]) -> list[bytes]:
-    """Frames of each sample in the format of an SLCAN adapter."""
+    """Return the frames of each sample in the format of an SLCAN adapter."""
     return [b"".join(slcan.encode_frame(frame) for frame in group) for group in groups]
 
 
 def natnet_opening() -> list[bytes]:
-    """Messages of a server before its first frame."""
+    """Return the messages that a server sends before its first frame."""
     return [encode(_SERVER), encode(model_definition(_bodies(), BITSTREAM), BITSTREAM)]
 
 
 def natnet_datagrams(
     count: int, period_ns: int, places: Mapping[str, Vector] | None = None
 ) -> list[bytes]:
-    """Return the frames of a leg: every marker visible, every body tracked.
+    """Return the frames of a leg with all markers visible and all bodies tracked.
 
     Parameters
     ----------
     count, period_ns : int
         Number of frames, and their period, ns.
     places : mapping of str to Vector, optional
-        Markers of a rigid leg, m, z up, which sways along all axes; by default, all markers are on
-        a line.
+        Marker positions of a rigid leg, m, z up. The leg sways along all axes. By default, all
+        markers are on a line.
     """
     stage = NatNetFrameBuilder(_bodies(), "y", "missing")
     found = []

@@ -155,14 +155,14 @@ def oriented(states: Sequence[LimbState], segment: int) -> Array:
 
 
 def jumps(before: Sequence[LimbState], after: Sequence[LimbState], segment: int) -> Array:
-    """Return the change of the output by a fault over the predicted RMS error, shape (n,)."""
+    """Return the change of the output that a fault causes, in predicted RMS errors, shape (n,)."""
     claimed = np.array([state.segments[segment].sd for state in after], dtype=np.float64)
     moved = rotation.angle_between(oriented(before, segment), oriented(after, segment))
     return np.asarray(moved / (np.sqrt(3.0) * claimed))
 
 
 def joint_errors(states: Sequence[LimbState], person: Worn) -> Array:
-    """Return the angle between knee rotation and truth, rad, shape (n,)."""
+    """Return the angle between the estimated and the true knee rotation, rad, shape (n,)."""
     above, below = (rotation.conjugate(oriented(states, 0)), oriented(states, 1))
     true = rotation.multiply(rotation.conjugate(person.bones["thigh"]), person.bones["shank"])
     return rotation.angle_between(rotation.multiply(above, below), true)

@@ -1,4 +1,4 @@
-"""Tracks of measured angular rates, for lags of a gyro instead of an orientation filter."""
+"""Tracks of measured angular rates, for the lag of a gyroscope instead of a filter."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 GAP = 1.5
-"""Interval in nominal periods above which samples are missing."""
+"""Time between two samples, in nominal periods, above which samples are missing."""
 
 
 def rates_from_gyro(t_ns: NDArray[np.int64], w: Array, origin_ns: int) -> Rates:
-    """Return measured rates, rad/s, shape (n, 3), as a track; rows with NaN are missing."""
+    """Return measured rates, rad/s, shape (n, 3), as a track; rows with NaN are missing samples."""
     seen = np.isfinite(w).all(axis=1)
     t = 1e-9 * np.asarray(np.asarray(t_ns)[seen] - origin_ns, dtype=np.float64)
     step = np.diff(t)

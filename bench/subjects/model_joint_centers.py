@@ -1,8 +1,8 @@
 """Joint centers of musculoskeletal models in recorded trials, computed by OpenSim.
 
-Invariant: the reference is independent. Its model was scaled by others, follows markers by inverse
-kinematics, and shares no code with the estimators. It is not ground truth: the hip of a model comes
-from a regression or a scaling factor, and its joints follow skin markers.
+Invariant: the reference is independent. Its model was scaled by others, has poses from inverse
+kinematics, and shares no code with the estimators. The reference is not ground truth: the hip of a
+model is from a regression or a scaling factor, and its joints follow skin markers.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ if TYPE_CHECKING:
     from jointfit_daemon.files.mocap import MarkerTrial
 
 _EVERY = {"squats1": 5, "STS1": 5}
-"""Interval of the computed model poses, frames."""
+"""Step between the computed model poses, frames."""
 
 
 @dataclass(frozen=True, slots=True)
 class ModelTrial:
-    """Marker trial and joint positions of a model."""
+    """Marker trial, and joint positions of a model in this trial."""
 
     markers: MarkerTrial
     frames: NDArray[np.int64]
-    """Frames of `markers` to which the model was fitted."""
+    """Indices of the frames of `markers` to which the model was fitted."""
     centers: dict[str, NDArray[np.float64]]
-    """Joint centers by joint of the model, m, world z up, shape (len(frames), 3)."""
+    """Joint centers in the world (z up), m, shape (len(frames), 3), by joint of the model."""
 
 
 @cache
@@ -58,7 +58,7 @@ def opencap(data: Path, trial: str) -> ModelTrial:
 
 @cache
 def gait2354(data: Path) -> ModelTrial:
-    """Return the walk of OpenSim's gait2354, after its inverse kinematics, 0.4 to 1.6 s."""
+    """Return the walking trial of OpenSim's gait2354 after inverse kinematics, 0.4 to 1.6 s."""
     import opensim  # noqa: PLC0415 - optional, and slow to import
 
     source = data / "opensim_gait2354"
@@ -77,7 +77,7 @@ def gait2354(data: Path) -> ModelTrial:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Redirect the output of C++ code away from standard output, on which tables are printed."""
+    """Keep the output of C++ code out of standard output, which contains the tables."""
     sys.stdout.flush()
     kept, sink = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     os.dup2(sink, 1)
@@ -102,7 +102,7 @@ def _followed(
 def _positions(
     path: Path, table: TimeTable, every: int, joints: tuple[str, ...]
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the origin of every joint's child frame in every pose; z up."""
+    """Return the origin of every joint's child frame in every pose, z up."""
     import opensim  # noqa: PLC0415 - optional, and slow to import
 
     opensim.Logger.setLevelString("off")

@@ -1,6 +1,6 @@
-"""Two simulated bodies about a ball joint, both observed by noisy markers on soft tissue.
+"""Two simulated bodies with a ball joint, observed by noisy markers on soft tissue.
 
-Invariant: the joint is the origin of the parent; all random numbers come from the given generator.
+Invariant: the joint is the origin of the parent. All random numbers are from the given generator.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ AWAY_M = 0.2
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """Places of the markers and manner of movement of one subject."""
+    """Marker positions and movement of one subject."""
 
     parent: Array
-    """Markers of the parent, from the joint, m, shape (m, 3)."""
+    """Marker positions of the parent relative to the joint, m, shape (m, 3)."""
     child: Array
-    """Markers of the child when it is not rotated, m, shape (m, 3)."""
+    """Marker positions of the child without rotation, m, shape (m, 3)."""
     phase: Array
     """Phases of the rotation about the three axes, rad, shape (3,)."""
 
     @classmethod
     def random(cls, rng: np.random.Generator, markers: int) -> Subject:
-        """Return a subject with clusters `WIDTH_M` wide, `AWAY_M` from the joint."""
+        """Return a subject with clusters of width `WIDTH_M`, `AWAY_M` from the joint."""
         above, below = (_cluster(rng, markers, sign * AWAY_M) for sign in (1.0, -1.0))
         return cls(above, below, rng.uniform(0.0, 2.0 * np.pi, 3))
 
@@ -47,7 +47,7 @@ class Subject:
     def observe(
         self, rng: np.random.Generator, rom_deg: float, noise: float, soft_tissue: float = 0.0
     ) -> Movement:
-        """Return one recording: the parent moves as well, and both poses are fitted to markers.
+        """Return one recording; parent and child move, and both poses are fitted to markers.
 
         Parameters
         ----------
@@ -57,8 +57,8 @@ class Subject:
         noise : float
             Standard deviation of every coordinate of every marker, m.
         soft_tissue : float
-            RMS of each coordinate of the motion of the markers on the bone, a random polynomial of
-            second degree of the posture, m.
+            RMS of each coordinate of the marker motion relative to the bone, m. The motion is a
+            random polynomial of second degree in the posture.
         """
         v = self.turns(rom_deg)
         joint = rotation.to_matrix(rotation.exp(v))
@@ -90,7 +90,7 @@ def _cluster(rng: np.random.Generator, count: int, along: float) -> Array:
 
 
 def _artefact(rng: np.random.Generator, v: Array, count: int) -> Array:
-    """Return motion that repeats with posture, RMS 1, zero on average, shape (n, count, 3)."""
+    """Return a motion that depends on posture, with RMS 1 and mean 0, shape (n, count, 3)."""
     terms = np.concatenate((v, v * v, v * np.roll(v, 1, axis=1)), axis=1)
     terms = (terms - terms.mean(axis=0)) / terms.std(axis=0)
     moved = np.einsum("tf,fkc->tkc", terms, rng.normal(size=(terms.shape[1], count, 3)))

@@ -1,7 +1,7 @@
-"""Trials and unchanged OpenSim models with which refined markers are evaluated.
+"""Trials and unchanged OpenSim models for the evaluation of refined markers.
 
-Invariant: training and evaluation trials have different names; a chain is made from the model
-alone. All markers are free, including those that a model marks as fixed.
+Invariant: training and evaluation trials have different names, and a chain is made from the model
+alone. All markers are free, including markers that a model marks as fixed.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _WALK_S = (0.4, 1.6)
 _LEGS = ("pelvis", "femur", "tibia", "talus", "calcn", "toes")
 _STATIC, _STATIC_STEP = "static1", 10
 _STEPS = {"walking1": 1, "squats1": 10, "DJ1": 2, "STS1": 10}
-"""Interval of the training frames; evaluation uses fewer."""
+"""Step between training frames, by trial. The evaluation uses fewer frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +39,12 @@ class OpensimSubject:
     model: Path
     names: tuple[str, ...]
     trials: Mapping[str, MarkerTrajectories]
-    """Training frames."""
+    """Frames for training, by trial."""
     judged: Mapping[str, MarkerTrajectories]
-    """Frames of the same trials that OpenSim evaluates."""
+    """Frames of the same trials for evaluation by OpenSim, by trial."""
 
     def motion(self, name: str) -> MotionTrial:
-        """Return a trial in our axes."""
+        """Return a trial in the axes of this project."""
         trial = self.trials[name]
         return MotionTrial(name, to_z_up(trial.positions), trial.rate_hz)
 
@@ -58,12 +58,12 @@ class OpensimSubject:
     def verdicts(
         self, trials: Sequence[str], refined: ChainModel | None = None
     ) -> dict[str, Verdict]:
-        """Return the errors of OpenSim with the markers of the model, or with refined ones."""
+        """Return the errors of OpenSim with the markers of the model or with refined markers."""
         return {name: judge(self.model, self.judged[name], refined) for name in trials}
 
 
 def gait2354(data: Path) -> OpensimSubject:
-    """Return the example of OpenSim, scaled, its markers not adjusted: 73 frames, 31 markers."""
+    """Return the scaled example of OpenSim with unadjusted markers: 73 frames, 31 markers."""
     folder = data / GAIT
     model, path = folder / "subject01_scaledOnly.osim", folder / "subject01_walk1.trc"
     names = shared_markers(model, path)
@@ -96,14 +96,15 @@ def opencap_legs(data: Path) -> OpensimSubject:
 
 
 def opencap(data: Path, coarser: int = 2, *, computed: bool = False) -> OpensimSubject:
-    """Return OpenCap subject 4, scaled manually.
+    """Return OpenCap subject 4 with a manually scaled model.
 
     Parameters
     ----------
     coarser
         Ratio of training frames to evaluated frames.
     computed
-        Use the computed hip centers of the recording as markers: 45 instead of 43.
+        Whether to use the computed hip centers of the recording as markers. The trials then have 45
+        instead of 43 markers.
     """
     folder = data / OPENCAP
     model = folder / "models" / "manually_scaled.osim"

@@ -1,4 +1,4 @@
-"""Simulated runs of planar centers of rotation, many at once, and their evaluation."""
+"""Simulated runs of planar centers of rotation, computed together, and their evaluation."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ _AT_ONCE = 2000
 
 @dataclass(frozen=True, slots=True)
 class Runs:
-    """Centers of many runs about the origin."""
+    """Estimated centers of many runs. The true center is the origin."""
 
     centers: Array
     """Estimated centers, m, shape (runs, 2); NaN where no circle was found."""
     covariances: Array
     conditioning: Array
     bound: float
-    """RMS, m."""
+    """Bound of the RMS error, m."""
 
     @property
     def published(self) -> NDArray[np.bool_]:
@@ -62,7 +62,7 @@ def runs_on(
     tempered: bool = True,
     correlated: bool = False,
 ) -> Runs:
-    """Fit `runs` noisy arcs of `n` points at even intervals over `arc` degrees, ends included."""
+    """Fit `runs` noisy arcs of `n` equidistant points over `arc` degrees, ends included."""
     rng = np.random.default_rng(round(1000 * arc) + n)
     t = np.linspace(-0.5, 0.5, n) * np.deg2rad(arc)
     truth = arc_points(t, radius)
@@ -79,7 +79,7 @@ def runs_on(
 
 
 def upper_rms(found: Runs) -> float:
-    """Return the upper 95 % limit of the RMS error, from the scatter of the squares."""
+    """Return the upper 95 % limit of the RMS error, from the scatter of the squared errors."""
     square = (found.centers**2).sum(axis=1)
     square = square[np.isfinite(square)]
     return float(np.sqrt(square.mean() + 1.645 * square.std() / np.sqrt(len(square))))

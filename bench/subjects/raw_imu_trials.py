@@ -1,4 +1,4 @@
-"""Raw readings as bytes of an Xbus device, and two trials of a board with optical truth."""
+"""Raw readings as bytes of an Xbus device, and two board trials with optical truth."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 TRIALS = ("02_undisturbed_slow_rotation_B", "07_undisturbed_fast_rotation_B")
 RATE_HZ = 286
-"""Nominal rate, Hz; the trials have 2000/7 Hz, as the device's ticks show."""
+"""Nominal rate, Hz. The ticks of the device show that the trials have 2000/7 Hz."""
 PERIOD_NS = 3_500_000
 _KINDS = (Item.RATE_OF_TURN, Item.ACCELERATION, Item.MAGNETIC_FIELD)
 
@@ -36,14 +36,15 @@ class BoardTrial:
     """One IMU on a board that is turned by hand."""
 
     felt: tuple[Array, Array, Array]
-    """Rate, rad/s; specific force, m/s^2; magnetic field. Shape (n, 3), 32-bit floats."""
+    """Angular rate, rad/s, specific force, m/s^2, and magnetic field, each of shape (n, 3) as
+    32-bit floats."""
     optical: Array
-    """q_world_sensor, shape (n, 4); NaN where occluded."""
+    """Optical orientations q_world_sensor, shape (n, 4); NaN where occluded."""
     moving: NDArray[np.bool_]
 
 
 def load(data: Path, name: str) -> BoardTrial:
-    """Return a trial of the folder ``broad``, rounded to the precision of the wire."""
+    """Return a trial from the folder ``broad``, rounded to the precision of the wire format."""
     h5py = import_module("h5py")  # imported by this experiment only
     with h5py.File(data / "broad" / f"{name}.hdf5") as trial:
         rate, force, field = (
@@ -56,7 +57,7 @@ def load(data: Path, name: str) -> BoardTrial:
 
 
 def messages(felt: Sequence[Array]) -> list[bytes]:
-    """Counter, time, status and the given kinds of readings."""
+    """Return messages with counter, time, status and the given types of readings."""
     kinds = _KINDS[: len(felt)]
     return [
         xbus.encode(
@@ -75,7 +76,7 @@ def messages(felt: Sequence[Array]) -> list[bytes]:
 
 
 def decoder(*, magnetometer: bool, settle_s: float = 0.0) -> Decoder:
-    """Return a new decoder of the driver, configured as by rig.toml."""
+    """Return a new decoder of the driver with the settings of a rig.toml."""
     driver = find_driver("xbus")
     settings = driver.Settings(
         id="S1",
@@ -92,7 +93,7 @@ def decoder(*, magnetometer: bool, settle_s: float = 0.0) -> Decoder:
 
 
 def through_driver(felt: Sequence[Array], *, magnetometer: bool, settle_s: float = 0.0) -> Array:
-    """Return q_world_sensor from the driver, shape (n, 4)."""
+    """Return the orientations q_world_sensor from the driver, shape (n, 4)."""
     path = decoder(magnetometer=magnetometer, settle_s=settle_s)
     said = [
         item.q_world_sensor
@@ -104,7 +105,7 @@ def through_driver(felt: Sequence[Array], *, magnetometer: bool, settle_s: float
 
 
 def output_by_sample(felt: Sequence[Array], kept: Iterable[int], *, settle_s: float) -> Array:
-    """Return q_world_sensor of each sample, with magnetometer; NaN where there is no output.
+    """Return q_world_sensor of each sample, with magnetometer; NaN without an output.
 
     Only the messages of the samples `kept` arrive.
     """

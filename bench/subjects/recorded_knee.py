@@ -1,7 +1,8 @@
 """Knee with recorded soft-tissue artefact and filter errors on four virtual sensors, and a bone
 model.
 
-Loads `semireal_knee4imu` in the conventions of the project and computes errors as its tables do.
+The module loads `semireal_knee4imu` in the conventions of the project, and computes errors like the
+tables of that data set.
 """
 
 from __future__ import annotations
@@ -29,10 +30,11 @@ TRAINING_SHARE = 0.6
 
 @dataclass(frozen=True, slots=True)
 class KneeTrial:
-    """One movement, only frames with all markers."""
+    """One movement; only frames with all markers are included."""
 
     sensors: tuple[Array, Array, Array, Array]
-    """S1, S2 on the thigh, S3, S4 on the shank: bone-aligned q_world_segment, shape (n, 4)."""
+    """Bone-aligned orientations q_world_segment of S1 and S2 (thigh) and S3 and S4 (shank), shape
+    (n, 4) each."""
     thigh: Array
     shank: Array
 
@@ -41,7 +43,7 @@ class KneeTrial:
         return KneeTrial((a, b, c, d), self.thigh[frames], self.shank[frames])
 
     def turned(self, angle: float) -> KneeTrial:
-        """Return the same movement of a subject who faces another way, rad about the vertical."""
+        """Return the movement with the subject rotated about the vertical by `angle`, rad."""
         turn = rotation.heading(angle)
         a, b, c, d = (rotation.multiply(turn, q) for q in self.sensors)
         return KneeTrial(
@@ -62,13 +64,13 @@ def load(data: Path, name: str) -> KneeTrial:
         ]
         columns += [_unit(arrays["q_femur_r"]), _unit(arrays["q_tibia_r"])]
     seen = np.all([np.isfinite(q).all(axis=1) for q in columns], axis=0)
-    # Y-up file: (w, x, y, z) becomes (w, z, x, y) when world and segment axes are renamed alike
+    # The file has y up. If world and segment axes are renamed, (w, x, y, z) becomes (w, z, x, y).
     a, b, c, d, thigh, shank = (q[seen][:, [0, 3, 1, 2]] for q in columns)
     return KneeTrial((a, b, c, d), thigh, shank)
 
 
 def training_frames(trial: KneeTrial) -> int:
-    """Return the number of frames in the first 60 %."""
+    """Return the number of frames in the first 60 % of a trial."""
     return int(TRAINING_SHARE * len(trial))
 
 

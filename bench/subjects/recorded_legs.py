@@ -1,9 +1,10 @@
 """Both legs of a recorded adult with soft-tissue artefact, eight deals of filter errors, and two
 references.
 
-Loads `semireal_knee4imu_v2`. Its two references are solutions of the same model with markers as
-fitted, and placed from the static trial. They differ by up to 20 deg about the long axis of the
-thigh, so a gain that only one of them shows is a gain on the error of that reference.
+The module loads `semireal_knee4imu_v2`. Its two references are solutions of the same model, with
+fitted markers and with markers from the static trial. They differ by up to 20 deg about the long
+axis of the thigh. If only one reference shows an improvement, the improvement is on the error of
+that reference.
 """
 
 from __future__ import annotations
@@ -33,21 +34,21 @@ class LegCase(NamedTuple):
     """One leg with one set of filter errors and one reference."""
 
     leg: str
-    """Key of `LEGS`."""
+    """Leg, a key of `LEGS`."""
     deal: int
-    """Assignment of recorded filter errors to the sensors."""
+    """Number of the assignment of recorded filter errors to the sensors."""
     reference: str
-    """Key of `REFERENCES`."""
+    """Reference, a key of `REFERENCES`."""
 
 
 def all_cases(reference: str) -> list[LegCase]:
-    """Return both legs with every deal."""
+    """Return the cases of both legs with every assignment of filter errors."""
     return [LegCase(leg, deal, reference) for leg in LEGS for deal in DEALS]
 
 
 @cache
 def recorded_leg(data: Path, movement: str, case: LegCase) -> KneeTrial:
-    """Return a movement of a leg; the mounts are those of its static trial in the same case."""
+    """Return a movement of a leg; the alignments are from its static trial in the same case."""
     sensors, bones = _orientations(data, movement, case)
     mounts = [
         rotation.average(rotation.multiply(rotation.conjugate(q), bone))

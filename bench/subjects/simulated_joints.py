@@ -1,6 +1,6 @@
-"""Simulated joints: true paths, noisy markers, and frames fitted to them.
+"""Simulated joints: true paths, noisy markers, and frames fitted to the markers.
 
-Invariant: the center is the origin of the parent; all random numbers come from the given generator.
+Invariant: the center is the origin of the parent. All random numbers are from the given generator.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ CHI2_95 = {2: 5.991, 3: 7.815}
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """Observation of one run by cameras."""
+    """Camera observation of one run."""
 
     points: Array
-    """Markers of the child in the fitted frame of the parent, m, shape (n, k, 3)."""
+    """Child markers in the fitted frame of the parent, m, shape (n, k, 3)."""
     parent: BodyPoses
     child: BodyPoses
 
 
 def ball_turns(rng: np.random.Generator, rom_deg: float, n: int = 200) -> Array:
-    """Return rotations in all directions, (n, 3, 3)."""
+    """Return rotation matrices in all directions, shape (n, 3, 3)."""
     h = np.radians(rom_deg) / 2
     a, phi = h * np.sqrt(rng.uniform(size=n)), rng.uniform(0, 2 * np.pi, n)
     vectors = np.stack((a * np.cos(phi), a * np.sin(phi), rng.uniform(-h, h, n)), axis=1)
@@ -48,13 +48,13 @@ def ball_turns(rng: np.random.Generator, rom_deg: float, n: int = 200) -> Array:
 
 
 def hinge_turns(rom_deg: float, n: int = 200, axis: int = 2) -> Array:
-    """Return rotations about one axis, (n, 3, 3)."""
+    """Return rotation matrices about one axis, shape (n, 3, 3)."""
     angle = np.linspace(-0.5, 0.5, n) * np.radians(rom_deg)
     return np.asarray(rotation.to_matrix(rotation.exp(angle[:, None] * np.eye(3)[axis])))
 
 
 def star_turns(rom_deg: float, n: int) -> Array:
-    """Return a smooth movement through all directions, (n, 3, 3)."""
+    """Return the rotation matrices of a smooth movement in all directions, shape (n, 3, 3)."""
     s = np.linspace(0.0, 2.0 * np.pi, n)
     vectors = np.stack((np.sin(3 * s), np.sin(4 * s + 0.7), np.sin(5 * s + 1.3)), axis=1)
     return np.asarray(rotation.to_matrix(rotation.exp(np.radians(rom_deg) / 2 * vectors)))
@@ -66,7 +66,7 @@ def carried(turns: Array, markers: Array = CHILD) -> Array:
 
 
 def fan(arc_deg: float, n: int = 100) -> Array:
-    """Return paths of four markers in a plane, at different angles about the joint, (n, 4, 2)."""
+    """Return paths of four markers in a plane at different angles about the joint, (n, 4, 2)."""
     theta = np.linspace(0.0, np.radians(arc_deg), n)[:, None] + np.array(OFFSETS)
     return np.asarray(np.array(RADII)[:, None] * np.stack((np.cos(theta), np.sin(theta)), axis=-1))
 
@@ -80,7 +80,7 @@ def watched(
     template_error: float = 0.0,
     frame: Array = PARENT,
 ) -> Seen:
-    """Move the parent as well and observe both with noisy markers."""
+    """Move parent and child, and observe both with noisy markers."""
     n = len(turns)
     moved = rotation.to_matrix(rotation.exp(rng.normal(0, 0.1, (n, 3))))
     t = rng.normal(0, 0.05, (n, 3))
@@ -95,20 +95,20 @@ def watched(
 
 
 def sphere_bound(paths: Array, noise: float) -> float:
-    """Return the smallest mean squared error of a center from these true paths, m²."""
+    """Return the smallest possible mean squared error of a center from these true paths, m²."""
     u = paths / np.linalg.norm(paths, axis=-1, keepdims=True)
     u = u - u.mean(axis=0)
     return float(np.trace(np.linalg.inv(np.einsum("tja,tjb->ab", u, u)))) * noise**2
 
 
 def joint_bound(paths: Array, noise: float, frame: Array = PARENT) -> float:
-    r"""Return the same bound for markers relative to a parent fitted to noisy markers, m².
+    r"""Return the bound of `sphere_bound` for a parent frame that is fitted to noisy markers, m².
 
     .. math:: \left[ \sum_t A_t^T S_t^{-1} A_t \right]^{-1}, \qquad A_t = (U_t \; I), \quad
               S_t = σ^2 \left( I + U_t Σ_c U_t^T \right)
 
-    U are the directions, the columns of I belong to the radii, and Σ_c over σ² is the effect of the
-    fit on the center, common to all markers.
+    Here U are the directions, and the columns of I belong to the radii. Σ_c divided by σ² is the
+    effect of the fit on the center, which is common to all markers.
     """
     u = paths / np.linalg.norm(paths, axis=-1, keepdims=True)
     k = u.shape[1]

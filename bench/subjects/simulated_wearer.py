@@ -1,8 +1,8 @@
-"""Simulated wearer without wire formats: trials, a calibration and a stream of samples.
+"""Simulated subject without wire formats: trials, a calibration and a stream of samples.
 
-Invariant: wearer and sensors of the simulator on one clock. The same settings and seed as in a
-`jointfit-sim` process give the same subject with the same mounts, so a calibration made here fits
-its devices.
+Invariant: subject and sensors of the simulator have one clock. The same settings and seed as in a
+`jointfit-sim` process yield the same subject with the same alignments. A calibration from this
+module therefore fits the devices of the simulator.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ MOVES = {
     "arm": ("functional",),
     "trunk": ("functional",),
 }
-"""Motions of the functional calibration, of equal length, by limb."""
+"""Motions of the functional calibration, by limb. They have equal durations."""
 PLATE_S, STAND_S, FUNCTIONAL_S = 24.0, 9.0, 60.0
 _CAN_BLOCKS = 7
-"""Blocks of 256 identifiers with 11 bits."""
-_LEAD_S = 2.0  # the transition between two motions has ended
+"""Number of blocks of 256 identifiers in the range of 11-bit identifiers."""
+_LEAD_S = 2.0  # end of the transition between two motions
 
 
 @dataclass(frozen=True)
@@ -56,12 +56,12 @@ class Phases:
 
 @cache
 def phases(seed: int = 1, rate_hz: float = 100.0, limb: str = "leg") -> Phases:
-    """Return the trials of one wearer: 22 s of plate, 7 s of standing, 60 s of movement."""
+    """Return the trials of one subject: 22 s of plate, 7 s of standing, 60 s of movement."""
     return phases_of(Knobs(seed=seed, rate_hz=rate_hz), limb)
 
 
 def phases_of(knobs: Knobs, limb: str = "leg", geometry: LegGeometry | None = None) -> Phases:
-    """Return the trials of a wearer with other magnitudes of errors or other bones."""
+    """Return the trials of a subject with given error settings and bones."""
     rate_hz, moves = knobs.rate_hz, MOVES[limb]
     steps = [Step("plate", PLATE_S), Step("stand", STAND_S)]
     steps += [Step(name, FUNCTIONAL_S / len(moves)) for name in moves]
@@ -109,7 +109,7 @@ def _track(
 
 
 def fitted(rig: Rig, seed: int = 1) -> Calibration:
-    """Return the calibration of this wearer for `rig`."""
+    """Return the calibration of this subject for `rig`."""
     trials = phases(seed)
     settings = rig.calibration
     alignment = fit_plate_alignment(trials.align, settings)
@@ -118,7 +118,7 @@ def fitted(rig: Rig, seed: int = 1) -> Calibration:
 
 def bench_rig(rate_hz: float = 100.0, limb: str = "leg") -> Rig:
     """Return the rig of a simulated limb, with ports that are never opened."""
-    baud = 115_200 if rate_hz <= 100.0 else 921_600  # 400 Hz need 188 kbit/s
+    baud = 115_200 if rate_hz <= 100.0 else 921_600  # 400 Hz requires 188 kbit/s
 
     tables = ['[can.can0]\ninterface = "slcan"\nchannel = "/dev/null"\n']
     for number, (name, segment) in enumerate(LIMBS[limb].sensors.items(), 1):
@@ -142,7 +142,7 @@ def bench_rig(rate_hz: float = 100.0, limb: str = "leg") -> Rig:
 
 
 def walking(sensor: str, rate_hz: float, seconds: float) -> list[Quaternion]:
-    """Return q_world_sensor of one sensor during a walk."""
+    """Return the orientations q_world_sensor of one sensor during walking."""
     knobs = Knobs(rate_hz=rate_hz)
     t_s = np.arange(0.0, seconds, 1 / rate_hz)
     streams = [t_s if name == sensor else t_s[:0] for name in SENSORS]

@@ -1,12 +1,13 @@
-"""Knees of skin markers of the recorded subject: both legs, sit-to-stand included.
+"""Knee trials from skin markers of the recorded subject: both legs, including sit-to-stand.
 
-The recorded knee has the right leg without sit-to-stand. These trials are made from the subject's
-marker files in the same way. The orientation of a sensor is the Kabsch rotation of three
-neighbouring skin markers against their mean in the static trial, with the recorded error of a
-filter in the same movement (of squats for sit-to-stand). The reference is the subject's model,
-posed by our inverse kinematics without any marker of the thigh and shank clusters.
+The data set of the recorded knee contains the right leg without sit-to-stand. These trials are made
+from the marker files of its subject in the same way. The orientation of a sensor is the Kabsch
+rotation of three neighbouring skin markers relative to their mean in the static trial. The recorded
+filter error in the same movement is added (in squats for sit-to-stand). The reference is the
+subject's model, whose pose is from the inverse kinematics of this project, without any marker of
+the thigh and shank clusters.
 
-Invariant: no marker of a sensor contributes to its reference. All mounts come from the static
+Invariant: no marker of a sensor contributes to its reference. All alignments are from the static
 trial.
 """
 
@@ -33,11 +34,11 @@ if TYPE_CHECKING:
 SUBJECT = "opencap_subject4"
 MODEL = "optimized_scale_and_markers.osim"
 MOVEMENTS = {"squats1": 2, "walking1": 1, "DJ1": 1, "STS1": 2}
-"""Interval of the frames of 100 Hz, as in the recorded knee."""
+"""Step between used frames at 100 Hz, by movement, as in the recorded knee."""
 STATIC, STATIC_EVERY = "static1", 20
 RATE_HZ = 100.0
 CLUSTERS = ("thigh", "sh1", "sh2", "sh3", "sh4", "shank")
-"""Parts of the names of markers on thighs and shanks."""
+"""Substrings of the names of markers on thighs and shanks."""
 SENSORS = {
     "r": (
         ("r_thigh1", "r_thigh2", "r_thigh4"),
@@ -52,17 +53,19 @@ SENSORS = {
         ("L_shank_antsup", "L_sh2", "L_sh3"),
     ),
 }
-"""Three markers per sensor; the left shank has three in all, so its two sensors share them."""
+"""Three markers for each sensor. The left shank has only three markers, so its two sensors share
+them."""
 MEDIAL = ("r_mknee", "r_mankle", "L_mknee", "L_mankle")
-"""Markers present only in the static trial; with them the bones would differ in other trials."""
+"""Markers that only the static trial contains. With them, the bones would differ in other trials.
+"""
 
 
 AS_RECORDED = (0, 1, 2, 3)
-"""Filter errors of each sensor, as in the recorded knee."""
+"""Index of the filter error of each sensor, as in the recorded knee."""
 
 
 class _Leg(NamedTuple):
-    """Orientations of one leg before mounts and filters, shape (n, 4) each."""
+    """Orientations of one leg without alignment and filter errors, shape (n, 4) each."""
 
     skin: tuple[Array, ...]
     """Rotation of each sensor's markers since the static trial."""
@@ -124,8 +127,10 @@ def _legs(data: Path, name: str) -> dict[str, _Leg]:
 
 
 def _filter_errors(data: Path, movement: str, t_s: Array) -> list[Array]:
-    """Return the filter error of each sensor, q_world_world, shape (n, 4); none in the static
-    trial."""
+    """Return the filter error of each sensor, q_world_world, shape (n, 4).
+
+    The static trial has no filter error.
+    """
     if movement == STATIC:
         return [np.tile(rotation.IDENTITY, (len(t_s), 1))] * len(SENSORS["r"])
     known = movement if movement != "STS1" else "squats1"

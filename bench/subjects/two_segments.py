@@ -1,4 +1,4 @@
-"""Swinging thigh and shank with four markers each: the smallest chain for a benchmark."""
+"""Swinging thigh and shank with four markers each, the smallest chain for a benchmark."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def two_segments() -> ChainModel:
 
 
 def swing(model: ChainModel, count: int = 300) -> tuple[ChainState, NDArray[np.float64]]:
-    """Return a movement at 100 Hz and its noisy markers."""
+    """Return a movement at 100 Hz, and its noisy markers."""
     phase = np.linspace(0.0, 6.0, count)
     step = np.zeros((count, model.nq))
     step[:, 0], step[:, 3], step[:, 6] = 0.3 * np.sin(phase), 0.1 * phase, 0.6 * np.cos(phase)

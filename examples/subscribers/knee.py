@@ -1,6 +1,7 @@
-"""Print the knee flexion ten times a second: python knee.py [HOST [PORT [BASE]]].
+"""Print the knee flexion ten times per second: python knee.py [HOST [PORT [BASE]]].
 
-Needs `pip install aiomqtt`. BASE is [mqtt] base of rig.toml, by default jointfit/NAME.
+The script needs `pip install aiomqtt`. BASE is the key base of [mqtt] in rig.toml; the default is
+jointfit/NAME.
 """
 
 import asyncio
@@ -14,7 +15,7 @@ HOST, PORT, BASE = (*sys.argv[1:4], *DEFAULTS[len(sys.argv[1:4]) :])
 
 
 async def main() -> None:
-    """Subscribe, and again after each loss of the broker."""
+    """Subscribe; subscribe again after each loss of the broker."""
     while True:
         try:
             async with aiomqtt.Client(HOST, int(PORT)) as client:

@@ -1,1 +1,1 @@
-"""Recorded trials sent as bytes through the daemon."""
+"""Experiments that send recorded trials as bytes through the daemon."""

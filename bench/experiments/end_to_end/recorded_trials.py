@@ -1,6 +1,6 @@
 """Recorded trials replayed as bytes through the daemon, compared with the offline results.
 
-The expected value of each result is that of the same session offline, at the same frames; the
+The expected value of each result is the result of the same session offline, at the same frames. The
 tolerance is 0.1°.
 """
 
@@ -26,7 +26,8 @@ METHODS: tuple[Method, ...] = ("mean", "patent12", "patent6", "anchored")
 WALKERS: tuple[Method, ...] = ("patent12", "patent6", "anchored")
 ALLOWED_DEG = 0.1
 REPEATED_DEG = 0.01
-"""Largest angle between `pose` and the regression of the patent, evaluated from MQTT messages."""
+"""Largest accepted angle between `pose` and the regression of the patent from MQTT messages, deg.
+"""
 
 
 @cache

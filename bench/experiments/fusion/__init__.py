@@ -1,1 +1,1 @@
-"""Fusion of redundant sensors: recorded movements, simulated subjects, online learning."""
+"""Experiments on the fusion of redundant sensors: recordings, simulations, online learning."""

@@ -1,4 +1,4 @@
-"""Recursive and batch least squares; round trip of joint angles."""
+"""Recursive least squares compared with batch least squares, and round trip of joint angles."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def recursive(_: Path) -> list[Result]:
-    """15 regressors, 3 targets, 500 samples, forgetting factor 0.999."""
+    """Least squares with 15 regressors, 3 targets, 500 samples, and forgetting factor 0.999."""
     rng = np.random.default_rng(15)
     n, p, forgetting, ridge = 500, 15, 0.999, 0.01
     g, noise = rng.normal(size=(n, p)), 0.1 * rng.normal(size=(n, 3))

@@ -1,6 +1,6 @@
-"""Rotation of the knee, and its errors normalized by the predicted deviation.
+"""Rotation of the knee, and its errors divided by the predicted standard deviation.
 
-Invariant: recordings, training and hold-out are those of the experiments on segments.
+Invariant: recordings, training and hold-out are the same as in the experiments on segments.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ JOINT_GOALS = {"hold-out": 1.2, "walking": 3.0, "drop jump": 4.3}
 NORMALIZED = (0.5, 1.3)
 EQUAL = (0.5, 0.5)
 ROTATIONS = 3
-"""Joint rotation as the means of sensors measure it, and deviations among the sensors of each
-segment."""
+"""Number of rotations in a fit: the joint rotation from the sensor means, and deviations among the
+sensors of each segment."""
 
 
 def joint_itself(data: Path) -> list[Result]:
-    """RMS angle of the joint rotation, from both segments and from a fit to the joint alone.
+    """RMS error of the joint rotation, from both segments and from a fit to the joint alone.
 
-    The knee of the reference is a hinge: adduction and rotation are functions of flexion. A fit to
-    the joint learns these functions, which a real knee does not have.
+    The knee of the reference is a hinge, so adduction and rotation are functions of flexion. A fit
+    to the joint learns these functions, which a real knee does not have.
     """
     squats = Squats(data)
     judged = {
@@ -63,7 +63,7 @@ def joint_itself(data: Path) -> list[Result]:
 
 
 def normalized_errors(data: Path) -> list[Result]:
-    """RMS ratio of error to predicted deviation, after training on three movements."""
+    """RMS ratio of error to predicted standard deviation, after training on three movements."""
     squats = Squats(data)
     walk, jump = load(data, "walking1"), load(data, "DJ1")
     models = fusion_methods.models([squats.training, walk, jump])
@@ -83,8 +83,10 @@ def normalized_errors(data: Path) -> list[Result]:
 
 
 def _joint(trial: KneeTrial) -> tuple[Array, Array, Array]:
-    """Return the regressors of a joint fit, the joint rotation of the means, and that of the
-    reference."""
+    """Return the regressors of a joint fit, and two joint rotations.
+
+    The rotations are those of the sensor means and of the reference.
+    """
     a, b, c, d = trial.sensors
     seen = joint_rotation(fuse([a, b], EQUAL), fuse([c, d], EQUAL))
     pairs = [rotation.log(joint_rotation(*pair)) for pair in ((a, b), (c, d))]

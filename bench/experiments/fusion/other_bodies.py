@@ -1,7 +1,7 @@
-"""Simulated people that no method was developed on: other bones, sensor places and soft tissue.
+"""Simulated subjects that were not used in development, with other bones and soft tissue.
 
-The seeds are used nowhere else. Bone lengths, hip positions, sensor orientations on the segments
-and magnitudes of the soft-tissue artefact are drawn for every subject.
+No other experiment uses these seeds. Bone lengths, hip positions, sensor orientations on the
+segments and magnitudes of the soft-tissue artefact are random for every subject.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _MM = 1000.0
 
 
 def drawn_body(seed: int) -> tuple[Knobs, LegGeometry]:
-    """Draw the bones and the magnitudes of errors of one subject."""
+    """Draw random bones and error magnitudes for one subject."""
     rng = np.random.default_rng(seed)
     geometry = LegGeometry(
         thigh_m=rng.uniform(0.35, 0.50),
@@ -60,7 +60,7 @@ def drawn_body(seed: int) -> tuple[Knobs, LegGeometry]:
 
 
 def other_bodies(_: Path) -> list[Result]:
-    """Live errors of the default method and of the mean; errors of the segment lengths."""
+    """Live errors of the default method and of the mean, and errors of the segment lengths."""
     rig = bench_rig()
     found: dict[Method, list[Errors]] = {method: [] for method in METHODS}
     off_mm = []

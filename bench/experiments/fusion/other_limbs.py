@@ -1,9 +1,9 @@
 """Calibration and live angles of simulated arms, trunks and pairs of legs, without wire formats.
 
-Each seed is another subject, at the settings of the demo: alignment, headings, artefact,
-markers and sensor errors differ. A subject is calibrated on a plate, a static pose and 60 s of
-movement; the angles are those of 24 s afterwards, and their truth is that of the bones, in the
-convention of each joint.
+Each seed is another subject at the settings of the demo, with its own alignment, headings,
+artefact, markers and sensor errors. A subject is calibrated on a plate, a static pose and 60 s of
+movement. The angles are evaluated on the following 24 s. The truth is the angles of the bones, in
+the convention of each joint.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ MOVEMENTS = {
     "legs": ("walk", "squat", "sit_to_stand"),
 }
 GOAL_DEG = {"arm": 4.0, "trunk": 3.0, "legs": 3.0}
-"""Threshold of the median main angle of every joint."""
+"""Threshold for the median error of the main angle of every joint, deg."""
 RAISED = np.radians(30.0)
-"""Elevation from which on the plane of elevation is defined well enough to be evaluated."""
+"""Elevation above which the plane of elevation is well enough defined for the evaluation, rad."""
 ANGLES = {
     AngleConvention.FLEXION: ("flexion", "adduction", "rotation"),
     AngleConvention.ELEVATION: ("plane of elevation", "elevation", "axial rotation"),
@@ -58,11 +58,11 @@ _UNDEFINED_AT_REST = ("plane of elevation", "axial rotation")
 class _Live(NamedTuple):
     states: list[LimbState]
     bones: Mapping[str, Array]
-    """q_optical_segment, shape (n, 4)."""
+    """Orientations q_optical_segment by segment, shape (n, 4)."""
 
 
 def spread(limb: str, _: Path) -> list[Result]:
-    """Return median and worst RMS errors over the subjects, of angles and of segments."""
+    """Median and worst RMS errors over the subjects, for angles and segments."""
     rig = bench_rig(limb=limb)
     subjects = [found for seed in SEEDS if (found := _live(limb, rig, seed)) is not None]
     figures = [
@@ -80,7 +80,7 @@ def spread(limb: str, _: Path) -> list[Result]:
 
 
 def _live(limb: str, rig: Rig, seed: int) -> _Live | None:
-    """Return the live part of one subject, or None if its static pose is refused."""
+    """Return the live part of one subject; None if its static pose is refused."""
     trials = phases(seed, limb=limb)
     alignment = fit_plate_alignment(trials.align, rig.calibration)
     pose = take_pose(trials.static, rig)
@@ -109,7 +109,7 @@ def _live(limb: str, rig: Rig, seed: int) -> _Live | None:
 
 
 def _errors(rig: Rig, live: _Live) -> dict[str, float]:
-    """Return RMS errors in degrees, and coverage, by name of joint and angle or of segment."""
+    """Return RMS errors, deg, and coverage, by name of the joint and angle or of the segment."""
     chain, found = rig.chain, dict[str, float]()
     for joint in inner_joints(chain):
         name, states = chain.joints[joint.number], [s.joints[joint.number] for s in live.states]
@@ -133,7 +133,7 @@ def _errors(rig: Rig, live: _Live) -> dict[str, float]:
                 if state.angles is not None
                 and (angle not in _UNDEFINED_AT_REST or bones.angles.adduction > RAISED)
             ]
-            off = np.angle(np.exp(1j * np.subtract(*np.transpose(pairs))))  # across the jump at pi
+            off = np.angle(np.exp(1j * np.subtract(*np.transpose(pairs))))  # handles the jump at pi
             found[f"{name}: {angle}"] = _rms_deg(off)
 
     for i, segment in enumerate(chain.segments):

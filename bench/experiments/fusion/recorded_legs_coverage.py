@@ -1,8 +1,8 @@
-"""Stated uncertainty of the default method on both legs of a recorded adult, by movement.
+"""Predicted uncertainty of the default method on both legs of a recorded adult, by movement.
 
-A case is one leg, one deal of filter errors and one reference. Its coverage is the share of the
-errors within 1.96 stated standard deviations: of flexion, and of each segment about all axes, with
-the stated standard deviation of the heading.
+A case is one leg, one assignment (deal) of filter errors and one reference. Its coverage is the
+share of errors within 1.96 predicted standard deviations. It is computed for flexion, and for each
+segment about all axes, including the predicted standard deviation of the heading.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 WITHIN = 1.96
 LEAST, MOST = 0.90, 0.99
-"""Wanted coverage."""
+"""Target range of the coverage."""
 INF = float("inf")
 
 
@@ -49,13 +49,13 @@ TRAININGS: dict[str, Training] = {
     "later parts": guided,
     "after squats": squats_alone,
 }
-"""Trained on the first 60 % of all movements, or on the first 60 % of the squats."""
+"""Training sets: the first 60 % of all movements, or the first 60 % of the squats."""
 THREE_DEALS = (0, 3, 6)
-"""Evaluated deals of filter errors."""
+"""Evaluated assignments (deals) of filter errors."""
 
 
 def coverage(data: Path, deals: Sequence[int] = THREE_DEALS) -> list[Result]:
-    """Return the median and the smallest coverage over legs and deals, by movement."""
+    """Median and smallest coverage over legs and deals, by movement."""
     results, shares = [], []
     for label, training in TRAININGS.items():
         for reference in REFERENCES:
@@ -98,7 +98,7 @@ def _shares(data: Path, case: LegCase, training: Training) -> dict[str, tuple[fl
 
 
 def segment_scores(model: SegmentModel, part: SegmentInputs) -> Array:
-    """Return errors about each axis of a segment over the stated ones, with heading."""
+    """Return the errors about each axis divided by the predicted ones, including heading."""
     said = model.predict(part.sensors, part.other)
     off = rotation.log(rotation.multiply(rotation.conjugate(said), part.bone))
     w, x, y, z = said.T

@@ -1,8 +1,9 @@
 """Every fusion method on twenty simulated subjects with soft-tissue artefact.
 
-Alignment, headings, soft-tissue artefact and sensor errors differ, at the settings of the demo.
-Trained on 60 s of four movements against skin markers, evaluated on 24 s afterwards, when errors
-and headings have drifted. Ground truth are the bones.
+Each subject has its own alignment, headings, soft-tissue artefact and sensor errors, at the
+settings of the demo. The methods are trained on 60 s of four movements with skin markers as
+reference. They are evaluated on the following 24 s, when errors and headings have drifted. The
+ground truth is the bones.
 """
 
 from __future__ import annotations
@@ -35,12 +36,12 @@ SEEDS = tuple(range(1, 21))
 SEGMENTS = ("thigh", "shank")
 TOLERANCE = 0.05
 STRIDE = 4
-"""Interval of the evaluated frames of the live part: neighbouring frames are correlated."""
+"""Step between evaluated frames of the live part, because neighbouring frames are correlated."""
 
 
 @cache
 def person(seed: int) -> tuple[KneeTrial, KneeTrial] | None:
-    """Return training and later trial of one subject; None if the static pose was rejected."""
+    """Return the training trial and the later trial of a subject; None without a static pose."""
     rig, trials = bench_rig(), phases(seed)
     pose = take_pose(trials.static, rig)
     optical = trials.functional.optical
@@ -72,7 +73,7 @@ def _knee(columns: list[Array]) -> KneeTrial:
 
 
 def simulated(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Errors of all methods; predicted errors of patent12, mean and the default."""
+    """Errors of all methods, and predicted errors of patent12, mean and the default method."""
     people = [found for seed in seeds if (found := person(seed)) is not None]
     figures = [Result("subjects accepted", len(people), len(seeds), len(seeds) - 2, unit="")]
     errors = {
@@ -110,7 +111,7 @@ def _coverage(people: list[tuple[KneeTrial, KneeTrial]]) -> list[Result]:
 
 
 def _segment_scores(taught: KneeTrial, later: KneeTrial) -> Array:
-    """Return errors about each axis of both segments over the predicted ones, with heading."""
+    """Return the errors about each axis divided by the predicted ones, including heading."""
     scores = []
     for model, part in zip(
         fusion_methods.models([taught]), fusion_methods.segments(later), strict=True

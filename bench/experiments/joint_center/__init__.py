@@ -1,1 +1,1 @@
-"""Functional joint centers in the plane and in space."""
+"""Experiments on functional joint centers in the plane and in space."""

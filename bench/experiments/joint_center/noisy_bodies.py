@@ -1,4 +1,4 @@
-"""Centers between two bodies with noisy markers: coverage and error by movement and markers."""
+"""Centers between two bodies with noisy markers: coverage and error, by movement and markers."""
 
 from __future__ import annotations
 
@@ -25,16 +25,20 @@ if TYPE_CHECKING:
 MM = 1000.0
 SUBJECTS = 8
 RUNS = 125
-"""Runs of one subject; the coverage of 1000 runs has a standard error of 0.7 %."""
+"""Number of runs per subject. The coverage of 1000 runs has a standard error of 0.7 %."""
 ANGLES_DEG = (20.0, 45.0, 90.0)
 WORST_PERCENT = 87.0
-"""Threshold of the subject with the least coverage: 4 standard errors below 95 % in 125 runs."""
+"""Threshold for the subject with the smallest coverage: 4 standard errors below 95 % for 125 runs.
+"""
 
 
 def estimates(
     rom: float, markers: int, errors: tuple[float, float], runs: int, method: str = "auto"
 ) -> list[list[CenterEstimate]]:
-    """Return the estimates of every run, one list per subject; `errors`: noise and artefact, m."""
+    """Return the estimates of every run, one list per subject.
+
+    The values in `errors` are the noise and the soft-tissue artefact, m.
+    """
     found = []
     for number in range(SUBJECTS):
         rng = np.random.default_rng([16, number, markers])
@@ -53,7 +57,7 @@ def held_percent(found: Iterable[CenterEstimate]) -> float:
 
 
 def measure_noise(runs: int) -> list[Result]:
-    """Measure coverage over all runs, of the worst subject, and the RMS errors."""
+    """Measure the coverage of all runs and of the worst subject, and the RMS errors."""
     results = []
     for rom, markers, noise in product(ANGLES_DEG, (3, 4), (0.5e-3, 1e-3, 2e-3)):
         people = estimates(rom, markers, (noise, 0.0), runs)
@@ -71,7 +75,7 @@ def measure_noise(runs: int) -> list[Result]:
 
 
 def compare_methods(runs: int) -> list[Result]:
-    """Compare the default with other methods on the same runs, noise 1 mm."""
+    """Compare the default method with other methods on the same runs, with a noise of 1 mm."""
     results = []
     for rom, method in product(ANGLES_DEG, ("score", "sphere", "halvorsen")):
         people = estimates(rom, 4, (1e-3, 0.0), runs, method)
@@ -88,7 +92,7 @@ def compare_methods(runs: int) -> list[Result]:
 
 
 def measure_soft_tissue(runs: int) -> list[Result]:
-    """Measure coverage of accepted centers with soft-tissue artefact, noise 0.3 mm."""
+    """Measure the coverage of accepted centers with soft-tissue artefact and a noise of 0.3 mm."""
     results = []
     for rom, markers, soft_tissue in product(ANGLES_DEG, (3, 4), (1e-3, 3e-3)):
         people = estimates(rom, markers, (3e-4, soft_tissue), runs)
@@ -108,7 +112,7 @@ def measure_soft_tissue(runs: int) -> list[Result]:
 
 
 def measure_gate(runs: int) -> list[Result]:
-    """Measure what a limit of the predicted error selects: one marker, arc of 30°, noise 2 mm."""
+    """Measure the effect of a limit of the predicted error: one marker, 30° arc, 2 mm noise."""
     rng = np.random.default_rng(20)
     theta = np.linspace(0.0, np.radians(30.0), 100)
     exact = 0.3 * np.stack((np.cos(theta), np.sin(theta)), axis=1)

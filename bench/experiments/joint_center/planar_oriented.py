@@ -1,4 +1,4 @@
-"""Centers of rotation from points with measured angles, right and wrong ones."""
+"""Centers of rotation from points with measured angles, with and without angle errors."""
 
 from __future__ import annotations
 
@@ -58,7 +58,10 @@ def angle_error(kind: Kind, size: float, rng: np.random.Generator) -> Array:
 
 @cache
 def rms_errors(arc: float, kind: Kind, degrees: float, runs: int) -> tuple[float, float, int]:
-    """Return the RMS errors with and without angles where both estimate, m, and the rejections."""
+    """Return the RMS errors with and without angles, m, and the number of rejections.
+
+    The errors include only runs in which both methods estimate a center.
+    """
     rng = np.random.default_rng(1000 + round(arc))
     theta = np.linspace(-0.5, 0.5, FRAMES) * np.deg2rad(arc)
     truth = arc_points(theta, RADIUS_M)
@@ -78,7 +81,7 @@ def rms_errors(arc: float, kind: Kind, degrees: float, runs: int) -> tuple[float
 
 
 def table(_: Path) -> list[Result]:
-    """RMS error with angles over that of Hyper alone."""
+    """Ratio of the RMS error with angles to the RMS error of Hyper alone."""
     figures = []
     for arc in ARCS:
         for kind, degrees in (*STATED, *BEYOND):
@@ -94,7 +97,7 @@ def table(_: Path) -> list[Result]:
 
 
 def short_arc(_: Path) -> list[Result]:
-    """Arc of 20° with slow errors of 1°, and the worst cases of the angle-noise experiment."""
+    """Errors on an arc of 20° with slow errors of 1°, and in the worst cases of angle noise."""
     with_angles, without, refused = rms_errors(20, "slow", 1.0, 200)
     figures = [
         Result("arc of 20°, slow noise of 1°: with angles", 1000 * with_angles, 28.0, unit="mm"),

@@ -1,7 +1,8 @@
 """Replication of the published numerical experiment, and tests of two claims of the publication.
 
-Table 1 is compared with its legible digits. The claims are that repetitions of a small rotation
-give an accurate mean, and that the distance of the marker from the center hardly matters.
+Table 1 is compared with its legible digits. The first claim is that repetitions of a small rotation
+yield an accurate mean. The second claim is that the distance of the marker from the center has
+little influence.
 """
 
 from __future__ import annotations
@@ -29,9 +30,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 EXPECTED = {"α–σ": (0.98, 0.81), "r–σ": (1.00, 0.99), "r–α": (0.96, 0.91)}
-"""From an independent implementation, at the clip that is nearest to the print."""
+"""Correlations from an independent implementation, at the clipping limit that is nearest to the
+publication."""
 LARGE_RADIUS_M = 0.07
-"""Radius, m, from which on it hardly matters at the noise of 5 mm."""
+"""Radius above which it has little influence with a noise of 5 mm, m."""
 
 
 @cache
@@ -57,7 +59,7 @@ def table_1(_: Path) -> list[Result]:
 
 
 def repeated_rotations(_: Path) -> list[Result]:
-    """Average repetitions of three frames: their centers, or the positions of the marker."""
+    """Mean of repetitions of three frames, over their centers or over the marker positions."""
     found = average_repetitions(StudySetup())
     figures: list[Result] = []
     for step, centers, positions in zip(np.rad2deg(STEPS_RAD), *found, strict=True):
@@ -71,7 +73,7 @@ def repeated_rotations(_: Path) -> list[Result]:
 
 
 def marker_radius(_: Path) -> list[Result]:
-    """Compare the errors at small radii with that at the largest."""
+    """Compare the errors at small radii with the error at the largest radius."""
     return [
         Result(
             f"{100 * radius:.0f} cm: 95th percentile, relative to the largest radius",

@@ -1,8 +1,8 @@
 """Hip and knee centers of recorded subjects, compared with the centers of their models.
 
-The thresholds are far above the measured values: they detect regressions. Along the axis of a hinge
-the center is undetermined, and the thigh skin slides over the femur with every step. Both are
-reported without a threshold.
+The thresholds are much larger than the measured values, so they detect regressions only. Along the
+axis of a hinge, the center is undetermined. The skin of the thigh slides over the femur in every
+step. The results of both have no threshold.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ KNEE_FLOOR_MM = 50.0
 
 
 def compare(trial: str, data: Path) -> list[Result]:
-    """Return the distances from the model's centers and the predicted errors."""
+    """Distances from the model's centers, and predicted errors."""
     figures: list[Result] = []
     for found in judged(data, trial, METHODS):
         floor = KNEE_FLOOR_MM if "knee" in found.joint.name else inf

@@ -1,1 +1,1 @@
-"""Inverse kinematics and marker refinement."""
+"""Experiments on inverse kinematics and marker refinement."""

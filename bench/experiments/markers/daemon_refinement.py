@@ -1,8 +1,8 @@
 """Effect of marker refinement in the daemon, measured against the bones.
 
-Simulated subjects are calibrated with `refine_markers` on and off. For some, a marker of each
-segment is displaced between static pose and movement. Live errors are compared subject by subject;
-the optical reference enters only through them.
+Simulated subjects are calibrated with and without `refine_markers`. For some subjects, one marker
+of each segment is displaced between static pose and movement. Live errors are compared for each
+subject. The optical reference affects the comparison only through the calibrations.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ if TYPE_CHECKING:
 KNOCKED = {"thigh": "T2", "shank": "C2"}
 KNOCKED_M = 0.015
 FEW = 4
-"""Subjects with displaced markers."""
+"""Number of subjects with displaced markers."""
 NOTHING = float("inf")
 COSTS_NOTHING_DEG = 0.1
 
 
 def refined(_: Path) -> list[Result]:
-    """Change of live errors by refinement, deg; negative is better."""
+    """Change of live errors by refinement, deg; a negative value is an improvement."""
     rig = bench_rig()
     worn: list[Array] = []
     knocked: list[Array] = []
@@ -81,7 +81,7 @@ def refined(_: Path) -> list[Result]:
 def _change(
     rig: Rig, pose: StaticPose, functional: CalibrationTrial, alignment: PlateAlignment, live: Live
 ) -> tuple[Array, Calibration]:
-    """Return the errors of knee, thigh and shank with refinement less those without, deg."""
+    """Return the change of the errors of knee, thigh and shank by refinement, deg."""
     found = [
         fit_calibration(
             pose, functional, alignment, replace(rig.calibration, refine_markers=on), rig.chain
@@ -104,7 +104,7 @@ def _changes(label: str, found: list[Array], goal: float) -> list[Result]:
 
 
 def _knocked(functional: CalibrationTrial, pose: StaticPose, seed: int) -> CalibrationTrial:
-    """Return the movement with one marker of each segment displaced on its segment."""
+    """Return the movement with one displaced marker on each segment."""
     optical, rng = functional.optical, np.random.default_rng(seed)
     if optical is None:
         return functional

@@ -35,7 +35,7 @@ _ROOT_SHIFT = [3, 4, 5]
 
 
 def slope(data: Path) -> list[Result]:
-    """Central differences at 5 instants of walking."""
+    """Jacobian compared with central differences at 5 frames of walking."""
     model = oc4_lower(data)
     state = solve_frames(model, measured(data, "walking1", model)[::26]).state
     told, h, off = jacobian(model, state), 1e-6, 0.0
@@ -49,7 +49,7 @@ def slope(data: Path) -> list[Result]:
 
 
 def fit(data: Path) -> list[Result]:
-    """Tracking error without refinement, all instants."""
+    """Tracking error of all frames without refinement."""
     model = oc4_lower(data)
     figures = []
     for trial, expected in EXPECTED_MM.items():
@@ -60,7 +60,7 @@ def fit(data: Path) -> list[Result]:
 
 
 def exact(data: Path) -> tuple[ChainModel, ChainState, Array]:
-    """Return the model, its walk and noise-free markers of that walk."""
+    """Return the model, its walking poses, and the noise-free markers of these poses."""
     model = oc4_lower(data)
     truth = solve_frames(model, measured(data, "walking1", model)).state
     return model, truth, marker_positions(model, truth)
@@ -71,7 +71,7 @@ def turns_off_deg(model: ChainModel, a: ChainState, b: ChainState) -> Array:
 
 
 def occluded(data: Path) -> list[Result]:
-    """Every segment loses one marker in half of all instants; then 20 % of all markers are lost."""
+    """Occlusion of one marker per segment in half of all frames, and of 20 % of all markers."""
     model, truth, clean = exact(data)
     rng = np.random.default_rng(0)
     y = clean.copy()
@@ -106,7 +106,7 @@ def batch_us(model: ChainModel, y: Array) -> float:
 
 
 def live_us(model: ChainModel, y: Array) -> tuple[float, float]:
-    """Return the median time an instant with covariance, and the tracking error, mm."""
+    """Return the median time per frame with covariance, and the tracking error, mm."""
     live = LiveInverseKinematics(model)
     residuals: list[Array] = []
 
@@ -118,7 +118,7 @@ def live_us(model: ChainModel, y: Array) -> tuple[float, float]:
 
 
 def speed(data: Path) -> list[Result]:
-    """Seven segments, 29 markers, 20 degrees of freedom; then two segments."""
+    """Speed with seven segments, 29 markers and 20 degrees of freedom, and with two segments."""
     model = oc4_lower(data)
     y = measured(data, "walking1", model)
     small = two_segments()

@@ -1,6 +1,6 @@
-"""Every movement unseen once: markers refined on the others, evaluated by OpenSim.
+"""Markers refined on all movements but one, and evaluated by OpenSim on the remaining movement.
 
-Nothing is chosen on the evaluated movements: prior, weights and the loss are the defaults of the
+No setting is chosen on the evaluated movements. Prior, weights and loss are the defaults of the
 other experiments with OpenSim.
 """
 
@@ -33,11 +33,12 @@ if TYPE_CHECKING:
 _MM, _MM2 = 1000.0, 1e6
 _SETTINGS = RefinementSettings(huber_m=None, frames=40)
 _STUCK_M = 0.001
-"""Excess of OpenSim's error in a frame over that of the restarted solution: a local minimum, m."""
+"""Difference between OpenSim's error in a frame and the error of the restarted solution, m, that
+indicates a local minimum."""
 
 
 def every_movement(data: Path) -> list[Result]:
-    """Pelvis and legs; the static pose and three movements are trained, the fourth is evaluated."""
+    """Pelvis and legs: train on the static pose and three movements, evaluate on the fourth."""
     subject = opencap_legs(data)
     figures, errors, stuck = [], [], 0
     for name in EVERYTHING:
@@ -81,7 +82,7 @@ def _less(before: float, after: float) -> float:
 
 
 def _squared(subject: OpensimSubject, name: str, model: ChainModel) -> Array:
-    """Return squared errors of the evaluated frames, restarted, m², shape (frames, markers)."""
+    """Return the squared errors of the restarted solution, m², shape (frames, markers)."""
     targets = to_z_up(subject.judged[name].positions)
     weights = np.isfinite(targets).all(axis=-1).astype(float)
     options = IkOptions(limit_m2=_SETTINGS.limit_m2)
@@ -91,13 +92,16 @@ def _squared(subject: OpensimSubject, name: str, model: ChainModel) -> Array:
 
 
 def _stuck(subject: OpensimSubject, name: str, model: ChainModel, judged: Array) -> int:
-    """Return the number of frames in which OpenSim's error exceeds the restarted solution's."""
+    """Return the number of frames in which OpenSim is in a local minimum."""
     ours = np.sqrt(np.nanmean(_squared(subject, name, model), axis=1))
     return int(np.count_nonzero(judged > ours + _STUCK_M))
 
 
 def _share_of_torso_and_arms(data: Path) -> dict[str, float]:
-    """Return the share of their 13 of all 43 markers, before any refinement, by movement."""
+    """Return the error share of the 13 markers of torso and arms, by movement.
+
+    The model has 43 markers, and no marker is refined.
+    """
     whole, legs = opencap(data), set(opencap_legs(data).names)
     upper = [i for i, name in enumerate(whole.names) if name not in legs]
     shares = {}

@@ -1,4 +1,4 @@
-"""Repeatability between operators: six place the markers of one subject with their own errors."""
+"""Repeatability between six operators, who place the markers of one subject with errors."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 OPERATORS = 6
 TEAMS = 5
-"""Groups of six operators."""
+"""Number of groups of six operators."""
 PLACEMENT_M = 0.01
-"""Standard deviation of the place of a marker per axis."""
+"""Standard deviation of a marker position per axis, m."""
 NOISE_M = 0.001
 _EVERY = {"walking1": 2, "squats1": 20, "DJ1": 4}
 _TRAINED = ("walking1", "squats1")
@@ -59,7 +59,7 @@ def spread_deg(errors: list[Array]) -> float:
 def team(
     model: ChainModel, truly: dict[str, ChainState], seed: int, settings: RefinementSettings
 ) -> dict[str, tuple[float, float]]:
-    """Return figures of six operators before and after the refinement."""
+    """Return the results of six operators before and after the refinement."""
     rng = np.random.default_rng([61, seed])
     errors: dict[str, tuple[list[Array], list[Array]]] = {name: ([], []) for name in truly}
     tracking, places = [], []
@@ -95,7 +95,7 @@ def team(
 
 
 def repeatability(data: Path, teams: int = TEAMS) -> list[Result]:
-    """Measure the median over teams before and after, and the worst ratio."""
+    """Measure the median over teams before and after refinement, and the worst ratio."""
     model, truly = oc4_lower(data), _movements(data)
     settings = RefinementSettings()
     found = [team(model, truly, seed, settings) for seed in range(teams)]

@@ -1,1 +1,1 @@
-"""Stillness, sensor-to-segment and world alignment, orientation on the gateway."""
+"""Experiments on rest detection, sensor and world alignment, and orientation on the gateway."""

@@ -1,7 +1,7 @@
-"""Orientation computed on the gateway from raw readings, through the driver.
+"""Orientation that the gateway computes from raw readings, through the driver.
 
-Compared with optics and with the filter package alone; and the error if the filter starts while the
-sensor moves.
+The orientation is compared with optical data and with the filter package alone. Another result is
+the error if the filter starts while the sensor moves.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ FAST = raw_imu_trials.TRIALS[1]
 STARTS = 20
 SECOND = round(1e9 / raw_imu_trials.PERIOD_NS)
 SETTLED_GOAL_DEG = 4.0
-"""Largest error at the first output, deg; later the fast trial has an error of 2.8 deg."""
+"""Largest error at the first output, deg. Later, the fast trial has an error of 2.8 deg."""
 ROUNDING_DEG = 1e-6
 """Largest difference due to rounding, deg."""
 
 
 def raw_orientation(data: Path) -> list[Result]:
-    """Bytes of gyroscope, accelerometer and magnetometer in, orientations out."""
+    """Errors of orientations from bytes of gyroscope, accelerometer and magnetometer."""
     figures = []
     for name in raw_imu_trials.TRIALS:
         trial = raw_imu_trials.load(data, name)
@@ -69,7 +69,7 @@ def _from_package(trial: raw_imu_trials.BoardTrial, said: Array | None, kind: st
 
 
 def begun_in_motion(data: Path) -> list[Result]:
-    """RMS error by second after the start of the filter, at twenty instants of fast motion."""
+    """RMS error by second after the start of the filter, for twenty starts during fast motion."""
     trial = raw_imu_trials.load(data, FAST)
     rng = np.random.default_rng(0)
     last = len(trial.moving) - 8 * SECOND
@@ -81,7 +81,7 @@ def begun_in_motion(data: Path) -> list[Result]:
         felt = [values[part] for values in trial.felt]
         for settle_s, errors in ((0.0, at_once), (LONGEST_SETTLE_S, settled)):
             said = raw_imu_trials.through_driver(felt, magnetometer=True, settle_s=settle_s)
-            # withheld orientations are at the beginning
+            # Orientations are withheld at the beginning only.
             optical = trial.optical[part][-len(said) :]
             errors.append(rotation.angle_between(said, optical)[: 3 * SECOND])
     figures = [

@@ -1,4 +1,4 @@
-"""Orientation filter on the gateway after a start or a gap, ten times per recorded trial."""
+"""Orientation filter on the gateway after a start or a gap, for ten starts per recorded trial."""
 
 from __future__ import annotations
 
@@ -20,17 +20,18 @@ if TYPE_CHECKING:
 STARTS = 10
 SECOND = round(1e9 / raw_imu_trials.PERIOD_NS)
 LENGTH = 23 * SECOND
-"""Samples of one run, 23 s."""
+"""Number of samples of one run, 23 s."""
 GAP = slice(11 * SECOND, 13 * SECOND)
-"""Samples lost in the gap."""
+"""Indices of the samples that are lost in the gap."""
 FIRST_MAX_DEG, LATER_MAX_DEG, GAP_MAX_DEG = 6.0, 4.0, 4.0
 
 
 def ten_starts(data: Path) -> list[Result]:
-    """Return the largest RMS error of a second, of ten starts spread over each trial.
+    """Largest RMS error of three periods of one second, among ten starts in each trial.
 
-    The seconds are the first one with output, the one around 10 s after the start, and the first
-    one with output after a gap of 2 s. The time to settle is that from start or gap to output.
+    The periods are the first second with output, the second around 10 s after the start, and the
+    first second with output after a gap of 2 s. The settling time is the time from start or gap to
+    output.
     """
     figures = []
     for path in sorted((data / "broad").glob("*.hdf5")):
@@ -61,7 +62,7 @@ def ten_starts(data: Path) -> list[Result]:
 
 
 def errors_of_start(trial: raw_imu_trials.BoardTrial, start: int) -> tuple[float, ...]:
-    """Return the RMS errors, deg, of the three seconds, and the two times to settle, s."""
+    """Return the RMS errors of the three periods, deg, and the two settling times, s."""
     part = slice(start, start + LENGTH)
     felt = [values[part] for values in trial.felt]
     optical = trial.optical[part]
@@ -80,12 +81,12 @@ def errors_of_start(trial: raw_imu_trials.BoardTrial, start: int) -> tuple[float
 
 
 def _first(q: Array, after: int) -> int:
-    """Return the first sample with output from a sample on."""
+    """Return the index of the first sample with output from index `after` on."""
     return after + int(np.flatnonzero(np.isfinite(q[after:, 0]))[0])
 
 
 def _rms_deg(q: Array, optical: Array, begin: int) -> float:
-    """Return the RMS error of the second that begins at a sample, deg."""
+    """Return the RMS error of the second that begins at a given sample, deg."""
     part = slice(begin, begin + SECOND)
     error = rotation.angle_between(q[part], optical[part])
     return float(np.rad2deg(np.sqrt(np.nanmean(error**2))))

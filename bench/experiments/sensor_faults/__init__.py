@@ -1,1 +1,1 @@
-"""Lost, stuck and slipping sensors, heading drift, magnetic disturbance."""
+"""Experiments on lost, stuck and slipping sensors, heading drift, and magnetic disturbance."""

@@ -1,1 +1,1 @@
-"""CPU time, latency and memory."""
+"""Experiments on CPU time, latency and memory."""

@@ -1,4 +1,4 @@
-"""Batch of recordings: two processes against one, and memory over a thousand recordings."""
+"""Batch of recordings: time with two processes and with one, and memory over many recordings."""
 
 from __future__ import annotations
 
@@ -23,15 +23,17 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 SAMPLES = 5000
-"""Samples of each sensor in a recording for the speed, 50 s: long beside the start of processes."""
+"""Number of samples of each sensor in a recording for the speed, 50 s. The processing is long
+compared with the start of a process."""
 COUNT, ROUNDS = 16, 2
-"""Recordings of a round, and alternating rounds."""
+"""Number of recordings per round, and number of alternating rounds."""
 MANY, WARM = 1000, 50
-"""Short recordings for the memory, and those after which all libraries are loaded."""
+"""Number of short recordings for the memory, and number of recordings after which all libraries are
+loaded."""
 
 
 def batch_results(quick: bool) -> list[Result]:
-    """Time batches on one and two processes in turn, then run a long one."""
+    """Measure batches with one and two processes in turn, then run a long batch."""
     count, rounds, many, warm = (4, 1, 40, 10) if quick else (COUNT, ROUNDS, MANY, WARM)
     with tempfile.TemporaryDirectory(prefix="jointfit-bench-") as temporary:
         folder = Path(temporary)
@@ -60,7 +62,7 @@ def batch_results(quick: bool) -> list[Result]:
 
 
 def _copies(folder: Path, count: int) -> Path:
-    """Record a run, and return a folder with copies of it."""
+    """Record a run, and return a folder with copies of the recording."""
     recorded_run.record_run(folder / "recorded")
     (file,) = (folder / "recorded").iterdir()
     trials = folder / "trials"
@@ -78,7 +80,7 @@ def _seconds(trials: Path, out: Path, jobs: int) -> float:
 
 
 def _memory(trials: Path, out: Path, warm: int) -> tuple[float, float]:
-    """Return the memory of the largest process after `warm` recordings and after all, MB."""
+    """Return the memory of the largest process after `warm` recordings and at the end, MB."""
     tasks = find_recordings(trials, out, ("report",), ())
     found = []
     for number, result in enumerate(run_in_pool(tasks, 2), start=1):

@@ -1,7 +1,7 @@
-"""Chain model in the daemon: cost of a camera frame, and of the slowest one with faulty markers.
+"""Chain model in the daemon: mean cost of a camera frame, and largest cost with faulty markers.
 
-The cost of the slowest frame is the largest of all frames, each with the least of its repeats, so
-that it does not depend on other processes.
+The cost of a frame is its smallest cost over the repeats, so other processes do not affect it. The
+cost of the slowest frame is the largest of these costs.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ RATE_HZ = 100
 NOISE_M = 0.001
 SECONDS = 2.5
 FAULTY_FROM = RATE_HZ
-"""Frame at which the markers become faulty."""
+"""Number of the frame at which the markers become faulty."""
 _TURNS, _NO_BODIES = np.zeros((0, 4)), np.zeros((0, 3))
 
 
 @cache
 def _sample() -> tuple[LoadedModel, LoadedModel, tuple[str, ...], Array]:
-    """Return the models of the sample data, and the markers of walking at 100 Hz with noise."""
+    """Return the models of the sample data, and noisy markers of walking at 100 Hz."""
     with TemporaryDirectory(prefix="jointfit-bench-") as folder:
         path = Path(folder)
         write_sample(path)
@@ -58,7 +58,7 @@ def _sample() -> tuple[LoadedModel, LoadedModel, tuple[str, ...], Array]:
 
 @cache
 def _both_legs() -> tuple[LoadedModel, tuple[str, ...], Array]:
-    """Return the leg twice on one pelvis, and its markers in the same movement."""
+    """Return a model with two equal legs on one pelvis, and its markers in the same movement."""
     loaded, _, names, points = _sample()
     leg = loaded.chain
     order = [names.index(name) for name in leg.marker_names]
@@ -94,7 +94,7 @@ def _frames(names: tuple[str, ...], points: Array) -> list[MocapFrame]:
 
 
 def _faulty(points: Array) -> Iterator[tuple[str, Array]]:
-    """Yield kinds of faults with the markers, from which no single frame may become slow."""
+    """Yield the name of each fault, and the faulty markers; no frame may become slow."""
     kinds: dict[str, Callable[[Array], Array]] = {
         "two labels of a segment exchanged": lambda p: p[:, [1, 0, *range(2, p.shape[1])]],
         "all labels exchanged": lambda p: p[:, ::-1],
@@ -112,7 +112,7 @@ def _faulty(points: Array) -> Iterator[tuple[str, Array]]:
 def _track(model: LoadedModel, frames: list[MocapFrame]) -> Callable[[], object]:
     tracker = ChainTracker(model, RATE_HZ)
     period_ns = round(1e9 / RATE_HZ)
-    tracker.add_frame(0, frames[0])  # the first frame has no frame before
+    tracker.add_frame(0, frames[0])  # the first frame has no previous frame
 
     def run() -> None:
         for k, frame in enumerate(frames[1:], start=1):
@@ -122,7 +122,7 @@ def _track(model: LoadedModel, frames: list[MocapFrame]) -> Callable[[], object]
 
 
 def _worst_us(model: LoadedModel, frames: list[MocapFrame], repeats: int) -> float:
-    """Return the CPU time of the slowest frame, each with the least of its repeats, µs."""
+    """Return the CPU time of the slowest frame, µs; each frame has the minimum of its repeats."""
     least = np.full(len(frames), np.inf)
     for _ in range(repeats):
         tracker = ChainTracker(model, RATE_HZ)

@@ -1,4 +1,4 @@
-"""BNO085: codecs and decoders per sample, compared with Adafruit's packages in the same run."""
+"""BNO085: codecs and decoders per sample, compared with Adafruit's packages."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ PACKETS = [
 
 
 def _whole(wires: list[bytes], baud: int) -> Callable[[], Callable[[], object]]:
-    """Return a function that prepares a run of the decoder of a mode, one sample a chunk."""
+    """Return a function that prepares a run of one mode's decoder, with one sample per chunk."""
     driver = find_driver("bno085")
     settings = driver.Settings(id="S1", segment="thigh", driver="bno085", port="p", baud=baud)
     start = b"" if baud == 115_200 else b"\x7e"
@@ -69,13 +69,13 @@ def _shtp_codec() -> Callable[[], object]:
 
 
 class _Wire:
-    """Bytes in place of the UART of a package."""
+    """Bytes that replace the UART of a package."""
 
     def __init__(self, messages: list[bytes]) -> None:
         self._data, self._at = b"".join(messages), 0
 
     def reset_input_buffer(self) -> None:
-        """Keep the bytes: the package would wait for the next frame."""
+        """Do nothing; otherwise, the package would wait for the next frame."""
 
     def read(self, size: int) -> bytes:
         self._at += size
@@ -83,7 +83,7 @@ class _Wire:
 
 
 def _package(name: str) -> Any:
-    """Return a package of Adafruit, without the hardware layer that it imports."""
+    """Return a package of Adafruit without the hardware layer that it imports."""
     busio, micropython = ModuleType("busio"), ModuleType("micropython")
     vars(busio)["UART"], vars(micropython)["const"] = object, int
     sys.modules.setdefault("busio", busio)
@@ -92,13 +92,13 @@ def _package(name: str) -> Any:
 
 
 def _rvc_peer() -> Callable[[], object]:
-    """Return the reading of the same frames by the package."""
+    """Return a function that reads the same frames with the package."""
     reader = _package("adafruit_bno08x_rvc").BNO08x_RVC(_Wire(FRAMES))
     return lambda: [reader.heading for _ in range(N)]
 
 
 def _shtp_peer() -> Callable[[], object]:
-    """Return the reading of the same packets by the package, without its start of the sensor."""
+    """Return a function that reads the same packets with the package, without sensor start."""
     base: Any = _package("adafruit_bno08x.uart").BNO08X_UART
     reader = type("Reader", (base,), {"initialize": lambda _: None})(_Wire(PACKETS))
 
@@ -114,7 +114,7 @@ def _shtp_peer() -> Callable[[], object]:
 def _in_turns(
     own: Callable[[], Callable[[], object]], peer: Callable[[], Callable[[], object]], quick: bool
 ) -> tuple[float, float]:
-    """Return the CPU time of one message of the peer, us, and the ratio of ours to it."""
+    """Return the peer's CPU time per message, us, and the ratio of our time to it."""
     ours: list[float] = []
     theirs: list[float] = []
     for _ in range(repeats(quick)):

@@ -1,7 +1,7 @@
-"""LPMS: codecs and decoders per message; on CAN beside cantools in the same run.
+"""LPMS: codecs and decoders per message, on CAN compared with cantools.
 
-No Python package reads LP-BUS, so that its codec has no peer. A CAN frame is also decoded by
-cantools, from a table of the same four signals.
+No Python package reads LP-BUS, so its codec has no comparison. In the same run, cantools decodes a
+CAN frame from a table of the same four signals.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ BO_ 385 LPMS1_TPDO1: 8 LPMS
 
 
 def _whole(name: str, chunks: list[Chunk], **table: object) -> Callable[[], Callable[[], object]]:
-    """Return a function that prepares a run of a decoder; check that each chunk gives a sample."""
+    """Return a function that prepares a decoder run; check that each chunk yields a sample."""
     driver = find_driver(name)
     settings = driver.Settings(id="S1", segment="thigh", driver=name, rate_hz=100, **table)
     decoder = driver(settings).decoder()

@@ -1,7 +1,7 @@
-"""LSL markers: codec and decoder per sample, beside pylsl reading the same stream.
+"""LSL markers: codec and decoder per sample, compared with pylsl on the same stream.
 
-pylsl receives the samples of a simulated program over the network of this host; counted is the CPU
-time of the thread that takes them, not of the threads in which liblsl receives.
+pylsl receives the samples of a simulated program over the network of this host. Only the CPU time
+of the thread that takes the samples counts, not that of the receiving threads of liblsl.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ N = 400
 PERIOD_NS = 10_000_000
 BODIES = tuple(f"Body{number}" for number in range(5))
 LONGEST_WAIT_S = 10.0
-"""Longest wait for the samples of one repeat, s."""
+"""Longest wait for the samples of one repetition, s."""
 
 
 class _Stream:
-    """A simulated program, and pylsl connected to it."""
+    """A simulated program, and a pylsl inlet that is connected to it."""
 
     def __init__(self) -> None:
         import pylsl  # noqa: PLC0415 - an extra
@@ -57,7 +57,7 @@ class _Stream:
             time.sleep(0.01)
 
     def take(self) -> list[tuple[list[float], float]]:
-        """Return the samples that pylsl received."""
+        """Return the samples that pylsl has received."""
         return [self.inlet.pull_sample(timeout=0.0) for _ in range(N)]
 
 
@@ -80,7 +80,7 @@ def rows(quick: bool) -> list[Result]:
         fresh.feed(Chunk(0, stream.description))
         return lambda: [fresh.feed(chunk) for chunk in chunks]
 
-    # both read the same samples
+    # Check that both read the same samples.
     check = LslCodec()
     check.feed(stream.description)
     own = [message for data in wire for message in check.feed(data)]

@@ -1,7 +1,8 @@
-"""MIP: codec and decoder per packet, compared with the vendor's library `pymscl` in the same run.
+"""MIP: codec and decoder per packet, compared with the vendor's library `pymscl`.
 
-The library reads a serial port in threads of its own. Both therefore read the same packets from a
-pty, in turns, up to the numbers in all fields, and the processor time of the whole process counts.
+The library reads a serial port in its own threads. Therefore, both read the same packets from a
+pseudo-terminal (pty) in turns, up to the numbers in all fields. The processor time of the whole
+process counts.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ PACKETS = [
     for k in range(N)
 ]
 BATCH = 50
-"""Packets on the pty at once: 1.8 kB, well below the buffer of a tty."""
+"""Number of packets on the pty at once: 1.8 kB, much less than its buffer."""
 _WAIT_MS = 5
 
 
@@ -61,7 +62,7 @@ def _decoder() -> Decoder:
 
 
 def own_rows(quick: bool) -> list[Result]:
-    """Measure codec and whole decoder, one packet a chunk."""
+    """Measure the codec and the whole decoder with one packet per chunk."""
     chunks = [Chunk(k * PERIOD_NS, data) for k, data in enumerate(PACKETS)]
     decoder = _decoder()
     given = [item for chunk in chunks for item in decoder.feed(chunk)]
@@ -82,7 +83,7 @@ def own_rows(quick: bool) -> list[Result]:
 
 
 class _Line:
-    """Pty with the packets of one batch at the other end."""
+    """Pseudo-terminal (pty) that receives the packets of one batch at the other end."""
 
     def __init__(self) -> None:
         self._far, self.near = pty.openpty()
@@ -94,7 +95,7 @@ class _Line:
         assert os.write(self._far, data) == len(data)
 
     def wait(self) -> None:
-        """Wait until the batch can be read here."""
+        """Wait until this end can read the batch."""
         until = time.monotonic() + 5.0
         while time.monotonic() < until:
             (count,) = struct.unpack("i", fcntl.ioctl(self.near, termios.FIONREAD, bytes(4)))
@@ -145,7 +146,7 @@ def _read_theirs(line: _Line, node: Any) -> float:
 
 
 def rows(quick: bool) -> list[Result]:
-    package = import_module("mscl")  # an oracle of the tests
+    package = import_module("mscl")  # also the reference in tests
     ours: list[float] = []
     theirs: list[float] = []
     line, other = _Line(), _Line()

@@ -1,4 +1,4 @@
-"""NatNet: codec and decoder per frame; the package `natnet` in the same run."""
+"""NatNet: codec and decoder per frame, and the package `natnet` in the same run."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PERIOD_NS = 8_333_333
 DATAGRAMS = device_bytes.natnet_datagrams(N, PERIOD_NS)
 MARKERS = sum(map(len, CLUSTERS.values()))
 HEADER_BYTES = 4
-"""Message number and size."""
+"""Size of message number and message size, bytes."""
 
 
 def _codec() -> Callable[[], object]:
@@ -49,7 +49,7 @@ def _decoder() -> Callable[[], object]:
 
 
 def _peer() -> Callable[[], object]:
-    """Return the reading of the same frames by the package."""
+    """Return a function that reads the same frames with the package."""
     frame_of = import_module("natnet.data_frame").DataFrame.read_from_buffer
     buffer_of = import_module("natnet.packet_buffer").PacketBuffer
     version = import_module("natnet.version").Version(*device_bytes.BITSTREAM)
@@ -65,7 +65,7 @@ def _peer() -> Callable[[], object]:
 
 
 def own_rows(quick: bool) -> list[Result]:
-    """Measure codec and whole decoder, one frame a chunk."""
+    """Measure the codec and the whole decoder with one frame per chunk."""
     found = _decoder()()
     assert isinstance(found, list)
     assert sum(isinstance(item, MocapFrame) for items in found for item in items) == N

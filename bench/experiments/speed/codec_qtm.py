@@ -1,4 +1,4 @@
-"""QTM and Vicon: codec and decoder per frame; the vendor's package `qtm-rt` in the same run."""
+"""QTM and Vicon: codec and decoder per frame, and the vendor's package `qtm-rt` in the same run."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ QTM_FRAMES = [_qtm_frame(k) for k in range(1, N + 1)]
 def _decoding(
     driver_name: str, opening: bytes, frames: list[bytes]
 ) -> Callable[[], Callable[[], object]]:
-    """Return a function that prepares a run of a decoder; each frame gives one result."""
+    """Return a function that prepares a decoder run; check that each frame yields a result."""
     driver = find_driver(driver_name)
     settings = driver.Settings(driver=driver_name, server="127.0.0.1")
     chunks = [Chunk(k * PERIOD_NS, data) for k, data in enumerate(frames, 1)]
@@ -80,8 +80,8 @@ def _qtm_codec() -> Callable[[], object]:
 
 
 def _peer() -> Callable[[], object]:
-    """Return the reading of the same components by the vendor's package."""
-    packet_of = import_module("qtm_rt.packet").QRTPacket  # an oracle of the tests
+    """Return a function that reads the same components with the vendor's package."""
+    packet_of = import_module("qtm_rt.packet").QRTPacket  # also the reference in tests
     payloads = [data[qtm.HEADER.size :] for data in QTM_FRAMES]
 
     def read() -> None:

@@ -1,7 +1,7 @@
-"""Self-described devices: codecs and decoders per message; on CAN with cantools in the same run.
+"""Devices with table-described messages: codecs and decoders per message, and cantools on CAN.
 
-The frame on CAN has four 16-bit integers. cantools decodes the same frame from the table of a DBC
-file.
+The CAN frame has four 16-bit integers. In the same run, cantools decodes the same frame from the
+table of a DBC file.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ BO_ 305 QUAT: 8 SBG
 
 
 def _whole(kind: str, messages: list[bytes]) -> Callable[[], Callable[[], object]]:
-    """Return a function that prepares a run of a decoder; check that each chunk gives a sample."""
+    """Return a function that prepares a decoder run; check that each chunk yields a sample."""
     name, table = TABLES[kind]
     driver = find_driver(name)
     head = {"id": "S1", "segment": "thigh", "driver": name, "rate_hz": 100}

@@ -1,6 +1,7 @@
 """VectorNav: codec and decoder per output.
 
-No package on PyPI reads binary outputs: `vectornav-vn200` asks for one register at a time as text.
+No package on PyPI reads binary outputs. The package `vectornav-vn200` requests single registers as
+text.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ OUTPUTS = [
 
 
 def rows(quick: bool) -> list[Result]:
-    """Measure codec and whole decoder, one output a chunk."""
+    """Measure the codec and the whole decoder with one output per chunk."""
     driver = find_driver("vectornav")
     settings = driver.Settings(id="S1", segment="thigh", driver="vectornav", port="p", rate_hz=200)
     chunks = [Chunk(k * PERIOD_NS, data) for k, data in enumerate(OUTPUTS)]

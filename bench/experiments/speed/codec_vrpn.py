@@ -1,4 +1,4 @@
-"""VRPN: codec and decoder per pose. No Python package decodes VRPN: its only client is C++."""
+"""VRPN: codec and decoder per pose. No Python package decodes VRPN, whose only client is in C++."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ WIRE = [
 
 
 def rows(quick: bool) -> list[Result]:
-    """Measure codec and whole decoder, one frame of several bodies a chunk."""
+    """Measure the codec and the whole decoder with one frame of several bodies per chunk."""
     driver = find_driver("vrpn")
     settings = driver.Settings(driver="vrpn", server="127.0.0.1", up_axis="y")
     chunks = [Chunk(n * PERIOD_US * 1000, data) for n, data in enumerate(WIRE, 1)]

@@ -1,4 +1,4 @@
-"""WitMotion: codec and decoder per frame, compared with the package `witmotion` in the same run."""
+"""WitMotion: codec and decoder per frame, compared with the package `witmotion`."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _own_codec() -> Callable[[], object]:
 
 
 def own_rows(quick: bool) -> list[Result]:
-    """Measure codec and whole decoder, one frame a chunk."""
+    """Measure the codec and the whole decoder with one frame per chunk."""
     driver = find_driver("witmotion")
     settings = driver.Settings(id="S1", segment="thigh", driver="witmotion", port="p", rate_hz=200)
     chunks = [Chunk(k * PERIOD_NS, data) for k, data in enumerate(FRAMES)]
@@ -54,7 +54,7 @@ def own_rows(quick: bool) -> list[Result]:
 
 
 class _Wire:
-    """Bytes in place of the serial port of the package; its reader stops at their end."""
+    """Bytes that replace the serial port of the package; its reader stops at their end."""
 
     def __init__(self, imu: Any) -> None:
         self._data, self._at, self._imu = b"".join(FRAMES), 0, imu
@@ -67,8 +67,8 @@ class _Wire:
 
 
 def _peer() -> Callable[[], object]:
-    """Return the receive loop of the package over the same bytes, without its thread."""
-    package = import_module("witmotion")  # an oracle of the tests
+    """Return the receive loop of the package on the same bytes, without its thread."""
+    package = import_module("witmotion")  # also the reference in tests
     imu = package.IMU.__new__(package.IMU)
     imu.should_exit = False
     received: list[object] = []

@@ -1,4 +1,4 @@
-"""x-IMU3: codec and decoder per message, compared with the vendor's package in the same run."""
+"""x-IMU3: codec and decoder per message, compared with the vendor's package."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ MESSAGES = [
     )
     for k in range(N)
 ]
-"""Messages; one in twelve contains an escape."""
+"""Messages for the measurement. One of twelve messages contains an escape sequence."""
 TURNS = 20
-"""Repetitions of the messages in the file of the comparison."""
+"""Number of repetitions of the messages in the file for the comparison."""
 BLOCK = 4096
-"""Bytes per read."""
+"""Number of bytes per read."""
 _LONGEST_S = 20.0
 
 
@@ -47,7 +47,7 @@ def _own_codec() -> Callable[[], object]:
 
 
 def own_rows(quick: bool) -> list[Result]:
-    """Measure codec and whole decoder, one message a chunk."""
+    """Measure the codec and the whole decoder with one message per chunk."""
     driver = find_driver("ximu3")
     settings = driver.Settings(id="S1", segment="thigh", driver="ximu3", port="p", rate_hz=400)
     chunks = [Chunk(k * PERIOD_US * 1000, data) for k, data in enumerate(MESSAGES)]
@@ -66,9 +66,9 @@ def own_rows(quick: bool) -> list[Result]:
 
 
 def _ours_s(file: Path) -> float:
-    """Return the CPU time for time and components of one message in a file, s."""
+    """Return our CPU time per message in a file, s; the result is the time and the components."""
     codec = ximu3.XImu3Codec()
-    read: list[object] = []  # messages whose values are numbers of Python
+    read: list[object] = []  # messages with Python numbers as values
     began = time.process_time()
     with file.open("rb") as stream:
         while block := stream.read(BLOCK):
@@ -79,12 +79,12 @@ def _ours_s(file: Path) -> float:
 
 
 def _theirs_s(file: Path, *, live: bool) -> float:
-    """Return the same for the package, which reads the file in a thread.
+    """Return the package's CPU time per message, s; the package reads the file in a thread.
 
-    It passes each message to a function. One in Python, as in live use, is slow. The fastest is
-    that of a list, whose messages are then read together.
+    The package passes each message to a function. A Python function, as in live use, is slow. The
+    fastest function is `list.append`, after which the messages are read together.
     """
-    package = import_module("ximu3")  # an oracle of the tests
+    package = import_module("ximu3")  # also the reference in tests
     received: list[Any] = []
     read: list[tuple[float, ...]] = []
 

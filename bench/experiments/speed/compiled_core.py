@@ -1,7 +1,7 @@
-"""Parts of the frame's path: compiled modules and their sources, in alternating runs.
+"""Parts of the frame's path: compiled modules compared with their sources, in alternating runs.
 
-Two processes are started on the same tree, one with ``JOINTFIT_PURE=1``. They measure each part in
-turn, so that both meet the same neighbours on a shared machine.
+Two processes run on the same tree, one of them with ``JOINTFIT_PURE=1``. They measure each part in
+turn, so the load of a shared machine affects both equally.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[3]
 TREE = ROOT / "build" / "compiled"
 ROUNDS = 5
 SLOWER = 1.1
-"""Threshold of compiled over pure time: compiling must not slow a part down."""
+"""Threshold for the ratio of compiled to pure time. Compilation must not slow a part down."""
 MEASUREMENTS = {
     "xbus: bytes to SI sample": ("xbus", None),
     "slcan: codec, one CAN frame": ("can", None),
@@ -39,12 +39,12 @@ MEASUREMENTS = {
     "core: 4 × 100 Hz, bytes to limb state, median": ("core", 80.0),
     "core: 4 × 400 Hz, bytes to limb state, median": ("core", 200.0),
 }
-"""Part that contains the measurement, and target of the compiled time, µs."""
+"""Part that contains the measurement, and target of the compiled time, µs, by measurement."""
 Process: TypeAlias = "subprocess.Popen[str]"
 
 
 def compiled_rows(quick: bool) -> list[Result]:
-    """Return the CPU times of both variants; nothing if there are no current compiled modules."""
+    """Return the CPU times of both variants; nothing if no current compiled modules exist."""
     if not _is_current():
         print("compiled-core: run `make compiled` first", file=sys.stderr)
         return []
@@ -78,9 +78,9 @@ def _is_current() -> bool:
 
 
 def _process(variant: str) -> Process:
-    """Start a process on one variant of the compiled tree."""
+    """Start a process that uses one variant of the compiled tree."""
     process = subprocess.Popen(
-        # -P: the checkout in the current folder must not come before the compiled tree
+        # -P prevents Python from importing the checkout in the current folder.
         [sys.executable, "-P", "-m", "bench.rigs.variant_process"],
         env=os.environ
         | {
@@ -111,7 +111,7 @@ def _answer(process: Process) -> str:
 
 
 def _round(both: dict[str, Process]) -> dict[str, dict[str, float]]:
-    """Return the times of each variant by measurement, µs; the variants take turns."""
+    """Return the times of each variant, µs, by measurement; the variants take turns."""
     times: dict[str, dict[str, float]] = {variant: {} for variant in both}
     for part in dict.fromkeys(part for part, _ in MEASUREMENTS.values()):
         for variant, process in both.items():

@@ -1,4 +1,4 @@
-"""Cost of the web dashboard: to the daemon, of its server, and in the browser."""
+"""Cost of the web dashboard: for the daemon, for its server, and in the browser."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _at_mosquitto(play: Callable[[Path, int], Coroutine[Any, Any, Found]]) -> Fo
 
 
 def viewer_results(quick: bool) -> list[Result]:
-    """Compare rounds without viewers, with one and with ten."""
+    """Compare rounds without viewers, with one viewer, and with ten viewers."""
     from bench.rigs.dashboard import measure_viewers  # noqa: PLC0415 - needs the browser's package
 
     rounds, seconds = (2, 2.0) if quick else (ROUNDS, ROUND_S)
@@ -55,7 +55,7 @@ def viewer_results(quick: bool) -> list[Result]:
         f"ten viewers minus none: mean {mean:.1f}, standard error {error:.1f}, {rounds}"
         f" pairs of rounds of {seconds:g} s; {without:.1f} without viewers"
     )
-    # Other work on the machine changes the CPU time of a round by more than any viewer could.
+    # Other processes change the CPU time of a round more than any number of viewers.
     certain = round(max(0.0, mean - 2.0 * error), 2)
     name = "daemon: extra CPU with ten viewers, mean minus two standard errors, at least 0"
     results = [timed_result(name, certain, "% of a core", 0.5, 3.0, note=note)]

@@ -1,4 +1,4 @@
-"""Load of a fleet: fifty simulated gateways at one mosquitto."""
+"""Load of a fleet of fifty simulated gateways with one mosquitto broker."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def fleet_results(quick: bool) -> list[Result]:
         print(f"not run: {reason}", file=sys.stderr)
         return []
     with tempfile.TemporaryDirectory(prefix="jointfit-bench-") as temporary:
-        # A station with bursts of all gateways needs a longer queue than 1000 messages.
+        # A station that receives bursts from all gateways needs a queue of more than 1000 messages.
         broker = MosquittoBroker(Path(temporary), more="max_queued_messages 10000\n")
         broker.start()
         try:

@@ -1,4 +1,4 @@
-"""From the pty to the subscriber: latency, CPU share, memory, start, samples unaccounted for."""
+"""Daemon from serial port to subscriber: latency, CPU share, memory, start, unaccounted samples."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Found = TypeVar("Found")
 
 
 def played(broker: str, play: Callable[[Path, int], Coroutine[Any, Any, Found]]) -> Found | None:
-    """Return the result of `play` at ``mosquitto`` or ``iotcore``; None if it is missing."""
+    """Return the result of `play` with a broker, or None if the broker is not installed."""
     needed = MosquittoBroker if broker == "mosquitto" else EmbeddedBroker
     if (reason := needed.missing()) is not None:
         print(f"not run: {reason}", file=sys.stderr)
@@ -124,7 +124,7 @@ def embedded_rows(quick: bool) -> list[Result]:
 
 
 def flood_rows(quick: bool) -> list[Result]:
-    """Measure one short run without requests and then under a flood of requests."""
+    """Measure one short run, first without requests and then under a flood of requests."""
     del quick
     load = Load(100.0)
     found = played("mosquitto", lambda folder, port: run_flooded(folder, port, load))

@@ -1,4 +1,4 @@
-"""Cost of orientations computed on the gateway: raw bytes of an Xbus device to oriented samples."""
+"""Cost of orientations that the gateway computes from raw bytes of an Xbus device."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Interpreted instructions of each part of the frame's path: a gate that no neighbour disturbs.
+"""Interpreted instructions of each part of the frame's path, independent of machine load.
 
-The counts are of the bytecode of the project's own functions, pure Python. They are equal on every
-machine and at any load. The counts do not include work done in NumPy or other C code, which times
-show.
+Only bytecode instructions in functions of the project (pure Python) count. The counts are equal on
+every machine and at any load. They do not include work in NumPy or other C code, which the times
+include.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ ROOT = f"{Path(__file__).resolve().parents[3]}/"
 PYTHON = (3, 11)
 """Version of Python whose bytecode is counted."""
 GROWTH = 1.1
-"""Threshold: count over the one of `KNOWN`. A wanted growth, or a large gain, is entered there."""
+"""Threshold for the ratio of a count to its value in `KNOWN`. After an intended growth or a large
+reduction, `KNOWN` is updated."""
 KNOWN = {
     "xbus: codec, one message": 157.0,
     "xbus: bytes to SI sample": 1089.9,
@@ -41,7 +42,7 @@ KNOWN = {
     "aligner: one sample": 792.5,
     "core: 4 × 100 Hz, not calibrated, one frame": 14721.9,
 }
-"""Instructions of one item, as last entered."""
+"""Reference number of instructions per item, by part."""
 
 
 def count_instructions(work: Callable[[], object]) -> int:
@@ -70,8 +71,8 @@ def count_instructions(work: Callable[[], object]) -> int:
 def _per_item(
     name: str, prepare: Callable[[], Callable[[], object]], *, items: int, **_: Any
 ) -> Result:
-    """Return the instructions of one item; in the place of the measurement of time."""
-    prepare()()  # what is cached once does not count
+    """Return the instructions per item; this function replaces the measurement of time."""
+    prepare()()  # fill the caches first
     count = count_instructions(prepare()) / items
     return Result(name, round(count, 1), round(GROWTH * KNOWN[name], 1), unit="instructions")
 
@@ -90,7 +91,7 @@ def _core_frames(seconds: float) -> Result:
 
 
 def counted_rows() -> list[Result]:
-    """Return the counts of all parts; nothing on another version of Python."""
+    """Return the counts of all parts; nothing with another version of Python."""
     if sys.version_info[:2] != PYTHON:
         print("instruction-counts: only on Python 3.11, whose bytecode is counted", file=sys.stderr)
         return []

@@ -1,4 +1,4 @@
-"""Poses from markers: all instants at once, and one after the other with covariance."""
+"""Poses from markers: all frames at once, and one after another with covariance."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _of(
 
     def live() -> Callable[[], object]:
         following = LiveInverseKinematics(model)
-        following.feed(y[0])  # starts without a previous pose
+        following.feed(y[0])  # the first frame has no previous pose
         return lambda: [following.feed(row) for row in y[1:]]
 
     count = len(y)

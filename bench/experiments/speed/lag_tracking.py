@@ -1,4 +1,4 @@
-"""Cost of lag tracking on the event loop: mean and maximum of its steps."""
+"""Cost of lag tracking on the event loop, as mean and maximum of its steps."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     Event = tuple[int, str, Quaternion | MocapFrame]
 
 FRAMES = 120 * 14
-"""One window of 10 s and the following hop, of four sensors each."""
+"""Number of frames in one window of 10 s and the following hop, for each of four sensors."""
 
 
 def _events() -> list[Event]:
-    """Return the samples of the sensors and the cameras of a moving wearer, in order of time."""
+    """Return the sensor and camera samples of a moving subject, in order of time."""
     trial = phases().functional
     track = trial.optical
     assert track is not None
@@ -46,7 +46,7 @@ def _events() -> list[Event]:
 
 
 def _play(watch: LagMonitor, events: list[Event]) -> tuple[float, float, float]:
-    """Return the CPU time of one sample, of the steps per second, and of the longest step, s."""
+    """Return three CPU times, s: per sample, of the steps per second, and of the longest step."""
     adding, steps = 0.0, []
     for t_ns, sensor, said in events:
         if isinstance(said, MocapFrame):

@@ -1,4 +1,4 @@
-"""Joint centers during movement: cost of a camera frame and of a progress report."""
+"""Joint centers during movement: costs of a camera frame and of a progress report."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 FRAMES, LOOKS = 1200, 30
 EVERY = 24
-"""Frames between two progress reports: five reports a second at 120 Hz."""
+"""Number of frames between two progress reports: five reports per second at 120 Hz."""
 
 
 def _frames() -> list[MocapFrame]:

@@ -1,8 +1,8 @@
-"""Shares of the CPU time of a running daemon by part of the program, sampled with py-spy.
+"""CPU time of a running daemon by part of the program, sampled with py-spy.
 
-A sample counts for the innermost function of the project on the stack: time in NumPy, orjson or the
-system counts for the function that calls it. A sample without any function of the project counts
-for the event loop.
+A sample counts for the innermost function of the project on the stack. Time in NumPy, orjson or the
+system therefore counts for the function that calls it. A sample without any function of the project
+counts for the event loop.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ RATE_HZ = 200.0
 SECONDS, QUICK_S = 30, 5
 SAMPLES_HZ = 100
 _FRAME = re.compile(r"\((\S+?)(?::\d+)?\)$")
-"""File of one function in a stack of py-spy, which is relative to the packages."""
+"""Pattern of the file name of a function in a py-spy stack, relative to the packages."""
 PARTS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("ports: reading of serial ports, CAN and sockets", (
         "jointfit_drivers/ports/", "jointfit_drivers/can_", "jointfit_protocols/can/",
@@ -58,17 +58,17 @@ PARTS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("queue, MQTT and socket", ("jointfit_daemon/outputs/mqtt/",)),
     ("core and supervisor: distribution of events, health", ("jointfit_daemon/",)),
 )  # fmt: skip
-"""Parts and the beginnings of their files; the first match counts."""
+"""Parts of the program, each with the prefixes of its files. The first match counts."""
 LOOP = "event loop: asyncio, aiomqtt and waiting for events"
 
 
 def part_of(stack: Iterable[str]) -> str:
-    """Return the part to which a stack of py-spy, outermost function first, belongs."""
+    """Return the part to which a py-spy stack belongs; the outermost function is first."""
     for function in reversed([*stack]):
         found = _FRAME.search(function)
         path = "" if found is None else found.group(1)
         if path.endswith("jointfit_daemon/__main__.py"):
-            break  # calls the event loop
+            break  # this function calls the event loop
         for part, beginnings in PARTS:
             if any(beginning in path for beginning in beginnings):
                 return part
@@ -86,7 +86,7 @@ def shares(text: str) -> dict[str, float]:
 
 
 async def _profile(folder: Path, port: int, seconds: int) -> tuple[dict[str, float], float]:
-    """Return the shares, and the CPU time of a frame, s."""
+    """Return the shares of the parts, and the CPU time of a frame, s."""
     written = folder / "stacks"
     async with running_gateway(folder, port, Load(RATE_HZ)) as gateway:
         frames, spent_s = len(gateway.heard.latencies_ms), cpu_s(gateway.pid)

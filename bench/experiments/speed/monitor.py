@@ -1,7 +1,7 @@
-"""Cost of the terminal monitor: bytes a second to the terminal, updates a second, CPU time.
+"""Cost of the terminal monitor: bytes and updates per second to the terminal, and CPU time.
 
-The monitor runs in a pseudo-terminal beside simulated devices and the daemon. Sizes and rates take
-turns, so that the load of the machine is the same for all of them.
+The monitor runs in a pseudo-terminal together with simulated devices and the daemon. Sizes and
+rates take turns, so the load of the machine is the same for all of them.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ if TYPE_CHECKING:
     from bench.framework.experiment import Result
 
 CASES = (((80, 24), 5.0), ((80, 24), 10.0), ((40, 20), 5.0), ((120, 40), 5.0))
-"""Columns and rows of the terminal, and ``--rate``."""
+"""Measured cases: columns and rows of the terminal, and value of ``--rate``."""
 ROUNDS, SECONDS, QUICK_S = 3, 6.0, 2.0
 WARM_UP_S = 12.0
-"""Time until the curve is full, not measured, s."""
+"""Time until the curve is full, s. It is not part of the measurement."""
 START_S = 40.0
 PAUSE_S = 0.025
-"""Output that follows within this time belongs to the same update, s: a large one arrives in parts.
+"""Longest pause within an update, s. A large update arrives in several parts.
 """
 LIMIT_HZ = 10.0
-"""Most updates a second."""
+"""Maximum number of updates per second."""
 
 
 @dataclass
 class Samples:
-    """Measurements of one case, one a round."""
+    """Measurements of one case, one per round."""
 
     bytes_s: list[float] = field(default_factory=list)
     updates_s: list[float] = field(default_factory=list)
@@ -59,7 +59,7 @@ async def _measure(base: str, port: int, seconds: float, rounds: int) -> list[Sa
 async def _one(
     samples: Samples, target: tuple[str, int], size: tuple[int, int], rate: float, seconds: float
 ) -> None:
-    """Add one measurement of the monitor of a base topic and a port."""
+    """Add one measurement of the monitor, with the base topic and broker port in `target`."""
     base, port = target
     command = [
         sys.executable, "-m", "jointfit_daemon.tools.__main__", "monitor", "--base", base,
@@ -79,7 +79,7 @@ async def _one(
 
 
 def updates(arrivals_s: list[float]) -> int:
-    """Return the number of updates in pieces of output."""
+    """Return the number of updates, from the arrival times of the output."""
     starts = arrivals_s[:1] + [
         later for before, later in pairwise(arrivals_s) if later - before > PAUSE_S
     ]

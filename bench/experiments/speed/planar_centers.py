@@ -1,4 +1,4 @@
-"""Centers of rotation, one frame at a time."""
+"""Cost of planar centers of rotation, one frame at a time."""
 
 from __future__ import annotations
 

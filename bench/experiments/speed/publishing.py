@@ -1,7 +1,8 @@
-"""CPU time of a pose to the broker: the daemon's connection, a minimal aiomqtt publisher, a socket.
+"""CPU time to publish a pose: the daemon's connection, a minimal aiomqtt publisher, a socket.
 
-The broker is a thread that accepts connections and discards what it reads. The CPU time is that of
-the publishing thread alone. As with poses, a message is sent after the one before was accepted.
+The broker is a thread that accepts connections and discards the received data. Only the CPU time of
+the publishing thread counts. As with poses, a message is sent after the previous message was
+accepted.
 """
 
 from __future__ import annotations
@@ -28,14 +29,14 @@ if TYPE_CHECKING:
 
 TOPIC = "jointfit/bench/pose"
 PAYLOAD = b"x" * 1200
-"""As long as the pose of two segments and three joints."""
+"""Payload with the length of a pose of two segments and three joints."""
 MESSAGES = 200
 _CONNACK = b"\x20\x03\x00\x00\x00"
 
 
 @contextlib.contextmanager
 def discarding_broker() -> Iterator[int]:
-    """Yield the port of a broker that accepts MQTT 5 connections and discards what they send."""
+    """Yield the port of a broker that accepts MQTT 5 connections and discards their data."""
     listener = socket.create_server(("127.0.0.1", 0))
 
     def serve(connection: socket.socket) -> None:
@@ -46,7 +47,7 @@ def discarding_broker() -> Iterator[int]:
                 pass
 
     def accept() -> None:
-        with contextlib.suppress(OSError):  # the listener was closed
+        with contextlib.suppress(OSError):  # the listening socket was closed
             while True:
                 threading.Thread(target=serve, args=(listener.accept()[0],), daemon=True).start()
 
@@ -64,7 +65,7 @@ async def _send(connection: MqttConnection) -> None:
 
 
 async def _cpu_s(publish: Callable[[], Awaitable[object]]) -> float:
-    """Return the CPU time of one message in this thread, s."""
+    """Return the CPU time per message in this thread, s."""
     began = time.thread_time()
     for _ in range(MESSAGES):
         await publish()
@@ -72,7 +73,7 @@ async def _cpu_s(publish: Callable[[], Awaitable[object]]) -> float:
 
 
 async def _measure(rounds: int) -> dict[str, list[float]]:
-    """Return the CPU times of each way to publish, s; the ways take turns."""
+    """Return the CPU times of each publisher, s; the publishers take turns."""
     asyncio.get_running_loop().set_exception_handler(DisconnectErrorFilter())
     times: dict[str, list[float]] = {}
     with discarding_broker() as port:
@@ -98,7 +99,7 @@ async def _measure(rounds: int) -> dict[str, list[float]]:
 
 
 def publish_rows(quick: bool) -> list[Result]:
-    """Return the CPU times, and the ratio to the library."""
+    """Return the CPU times, and the ratio of our time to that of the library."""
     times = asyncio.run(_measure(3 if quick else 15))
     middle = {name: statistics.median(found) for name, found in times.items()}
     loop = loop_s()

@@ -1,6 +1,6 @@
-"""Cost of a recording at 4 × 400 Hz: share of a core, memory, and size of the file.
+"""Cost of a recording at 4 × 400 Hz: share of a processor core, memory, and size of the file.
 
-The same process feeds the same events with and without recording, in turns.
+The same process sends the same events with and without recording, in turns.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[3]
 ROUNDS, SECONDS, QUICK_S = 3, 20.0, 10.0
 HOUR_S = 3600.0
 MOST_SHARE_PCT, MOST_MEMORY_MB = 3.0, 40.0
-"""Targets: share of a core, percent, and memory, MB."""
+"""Targets of the share of a core, percent, and of the memory, MB."""
 
 
 def _cost(folder: Path, seconds: float, *options: str) -> dict[str, Any]:

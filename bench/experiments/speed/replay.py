@@ -1,4 +1,4 @@
-"""CPU time of `jointfit replay`: verification and plain replay, beside reading of the file."""
+"""CPU time of `jointfit replay` for verification and replay, compared with reading the file."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.reprocessing import Verification
 
 SECONDS, ROUNDS = 90.0, 3
-"""Recorded time after the calibration, s, and alternating rounds."""
+"""Recorded time after the calibration, s, and number of alternating rounds."""
 GOAL_MS = 20.0
-"""CPU time per second of recording, ms: 50 times real time."""
+"""Target of the CPU time per second of recording, ms. It is 50 times real time."""
 
 
 def replay_results(_quick: bool) -> list[Result]:
@@ -39,8 +39,8 @@ def replay_results(_quick: bool) -> list[Result]:
 
 
 def measure(name: str, path: Path, rounds: int) -> list[Result]:
-    """Return the CPU time of a recording's reading, replay and verification."""
-    verified = _verify(path)  # also loads all libraries
+    """Return the CPU times to read, replay and verify a recording."""
+    verified = _verify(path)  # this call also loads all libraries
     work: dict[str, tuple[Callable[[], object], float | None]] = {
         "reading": (partial(_read, path), None),
         "replay": (partial(_replay, path), GOAL_MS),

@@ -1,4 +1,4 @@
-"""Streaming sphere fit: cost of a frame of one joint, and of an estimate."""
+"""Streaming sphere fit: costs of a frame of one joint, and of an estimate."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def feeding(watched: bool) -> Callable[[], Callable[[], object]]:
     def work() -> Callable[[], object]:
         stream = RunningSphere(4, forgetting=0.999)
         fill(stream, points[:50])
-        if watched:  # an estimate also searches for markers that leave their spheres
+        if watched:  # the estimate also detects markers that leave their spheres
             stream.estimate()
         return lambda: fill(stream, points)
 

@@ -1,4 +1,4 @@
-"""Cost of a start before any device is opened, and of a calibration fit."""
+"""Cost of a start until a device could be opened, and of a calibration fit."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CHECKING = "import jointfit_daemon.__main__, jointfit_daemon.config"
 
 
 def _imported(code: str, count: int) -> float:
-    """Return the median wall time of a Python process that runs `code`, less an empty one, s."""
+    """Return the median time of a Python process with `code`, less an empty process, s."""
     took = {code: [], "pass": []}  # type: dict[str, list[float]]
     for _ in range(count):
         for each, times in took.items():
@@ -49,7 +49,7 @@ def import_rows(quick: bool) -> list[Result]:
 
 
 def fit_rows(quick: bool) -> list[Result]:
-    """Jobs of the worker, on trials as long as those of the demo."""
+    """Measure the jobs of the worker process, on trials with the durations of the demo."""
     del quick  # one fit is fast enough
     trials, rig = phases(), bench_rig()
     alignment = fit_plate_alignment(trials.align, rig.calibration).to_dict()
@@ -66,7 +66,7 @@ def fit_rows(quick: bool) -> list[Result]:
 
 
 def exposure_rows(quick: bool) -> list[Result]:
-    """Exposure of the shipped unit by systemd-analyze: 0 is closed, 10 is open."""
+    """Exposure of the shipped systemd unit by systemd-analyze, from 0 (closed) to 10 (open)."""
     del quick
     tool = shutil.which("systemd-analyze")
     if tool is None:

@@ -1,7 +1,7 @@
-"""CPU time of the core on weak gateways: lower rates, and no cameras.
+"""CPU time of the core with settings for weak gateways: lower rates, and no cameras.
 
-One second of data of four sensors passes through a core with its own rig, and every pose is
-encoded. The settings take turns, so that a busy machine slows all of them.
+A core with its own rig processes one second of data of four sensors, and every pose is encoded. The
+settings take turns, so a busy machine slows all of them equally.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Setting:
 
     @property
     def name(self) -> str:
-        """Words for the table."""
+        """Name of the setting in the table."""
         cameras = "cameras of 100 Hz" if self.cameras else "no cameras"
         return f"4 × {self.sensors_hz:g} Hz, {cameras}, {self.poses_hz:g} poses/s"
 
@@ -60,7 +60,7 @@ SETTINGS = (
 
 
 class _Gateway:
-    """A core of one setting, and its events by second."""
+    """A core with one setting, and its events for each second."""
 
     def __init__(self, setting: Setting, seconds: int) -> None:
         self._setting = setting
@@ -95,7 +95,7 @@ class _Gateway:
 
 
 def _places() -> dict[str, Vector]:
-    """Return the markers of the calibrated leg in the static pose, m."""
+    """Return the marker positions of the calibrated leg in the static pose, m."""
     return {
         name: (cluster.origin[0] + x, cluster.origin[1] + y, cluster.origin[2] + z)
         for cluster in worn().clusters.values()
@@ -121,7 +121,7 @@ def _instant(event: Event) -> int:
 
 
 def rows(quick: bool) -> list[Result]:
-    """Return the CPU time of a second of data for each setting, and its share of the first."""
+    """Return the CPU time per second of data for each setting, and its ratio to the first."""
     rounds = QUICK_ROUNDS if quick else ROUNDS
     gateways = {setting: _Gateway(setting, SETTLE_S + rounds) for setting in SETTINGS}
     for gateway in gateways.values():

@@ -1,1 +1,1 @@
-"""Clocks, lag, alignment and memory."""
+"""Experiments on clocks, lag, alignment and memory."""

@@ -1,7 +1,7 @@
-"""Lag estimated in the align phase, on simulated plates turned by hand.
+"""Lag estimates of the align phase, on simulated plates that are turned by hand.
 
-Eight plates with four sensors each, errors of filters and cameras at the settings of the demo, 22
-s. All streams are on one clock, so the true lag is 0.
+Eight plates have four sensors each, with errors of filters and cameras at the settings of the demo,
+for 22 s. All streams have the same clock, so the true lag is 0.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ FREE = float("inf")
 
 
 def on_the_plate(_: Path) -> list[Result]:
-    """Errors of the lags of all sensors, ms and in their standard deviations."""
+    """Errors of the lags of all sensors, in ms and in predicted standard deviations."""
     settings = bench_rig().calibration
     lags, sigmas, refused = [], [], 0
     for seed in SEEDS:

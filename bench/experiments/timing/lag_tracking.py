@@ -1,4 +1,4 @@
-"""Drifting device clocks mapped live, and lag tracking on the mapped stamps."""
+"""Live mapping of drifting device clocks, and lag tracking with the mapped stamps."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ START = 7_000 * S
 MICROSECONDS = TickClock(1000, None)
 SERVER = TickClock(100, None)
 LEAST_MS = 2.0
-"""Delay of the sensor's transport, unknown to the clock model: this is the lag."""
+"""Delay of the sensor's transport, ms. The clock model cannot detect it, so it is the lag."""
 CHAIN = Chain(("hip", "knee"), ("thigh",), (("S1",),))
 LAYOUT = MocapLayout((), ("thigh",))
 CALIBRATION = Calibration(
@@ -41,7 +41,7 @@ CALIBRATION = Calibration(
 
 
 class Case(NamedTuple):
-    """Skews of both clocks, and a drift of the sensor's clock that no clock model can detect."""
+    """Skews of both clocks, and a drift of the sensor's clock that no model can detect."""
 
     sensor_ppm: float
     cameras_ppm: float
@@ -49,7 +49,7 @@ class Case(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Result of lag tracking at the end."""
+    """Final result of lag tracking."""
 
     lag_ms: float
     sigma_ms: float
@@ -59,7 +59,7 @@ class Found(NamedTuple):
 
 
 class _Stamps:
-    """Both clocks, fed as in the daemon."""
+    """Both clocks, which receive the same input as in the daemon."""
 
     def __init__(self, case: Case, seed: int) -> None:
         self._case, self._rng = case, np.random.default_rng(seed)
@@ -91,7 +91,7 @@ class _Stamps:
 
 
 def run(case: Case, seconds: float = 121.0, seed: int = 1) -> Found:
-    """Play a moving wearer through both clocks into lag tracking; return its result."""
+    """Process a moving subject's data with both clocks and lag tracking; return the result."""
     tracks, stamps = made_up(seed, seconds, 0.0), _Stamps(case, seed)
     watch, told = LagMonitor(CHAIN, CALIBRATION), []
     events: list[tuple[int, int, Quaternion]] = []
@@ -121,12 +121,14 @@ def run(case: Case, seconds: float = 121.0, seed: int = 1) -> Found:
 
 
 def drifting(_: Path) -> list[Result]:
-    """Clocks 100 ppm apart leave no drift; a drift outside the clock model is detected and
-    reported."""
+    """Clocks that differ by 100 ppm leave no drift.
+
+    A drift outside the clock model is detected and reported.
+    """
     figures = []
     for case in (Case(50.0, -50.0), Case(-50.0, 50.0, 5.0)):
         found = run(case)
-        # the lag of the tracker refers to the center of its window: up to 8 s before the end
+        # The lag of the tracker refers to the center of its window, up to 8 s before the end.
         truth = LEAST_MS + 1e-3 * case.unseen_ppm * 114.0
         slack = 1e-3 * abs(case.unseen_ppm) * 2.0
         off = max(0.0, abs(found.lag_ms - truth) - slack)
@@ -153,4 +155,4 @@ EXPERIMENTS = (
         SIMULATED_CLOCKS,
     ),
 )
-"""The lag is the delay that no clock model can detect, 2 ms, for any skew."""
+"""For any skew, the lag is the delay of 2 ms that no clock model can detect."""

@@ -1,7 +1,8 @@
-"""Lag windows of all recorded trials, short passages, and the error of the recorded stamps.
+"""Lag windows of all recorded trials and of short passages, and errors of the recorded stamps.
 
 The stamps of the recordings have a sawtooth error of one tick of the sensor's clock, 0.5 ms. A
-window that contains one second of fast motion sees a part of it, and its residuals do not show it.
+window that contains one second of fast motion covers only a part of the sawtooth, and its residuals
+do not reveal the error.
 """
 
 from __future__ import annotations
@@ -21,16 +22,16 @@ if TYPE_CHECKING:
 
 LENGTHS_S = (1.0, 2.0, 5.0, 10.0)
 HOP_S = {1.0: 0.5}
-"""Time between starts of windows, s, if not 2.5 s."""
+"""Time between the starts of windows, s, by window length, if it is not 2.5 s."""
 MOST_SIGMAS = 4.0
 TICK_MS, TICK_TOLERANCE_MS = 0.5, 0.05
-"""Tick of the sensor's clock, 1/2000 s, and the accuracy of its measured value."""
+"""Tick of the sensor's clock (1/2000 s), and tolerance of its measured value, ms."""
 SAWTOOTH_HZ = np.arange(0.3, 1.0, 0.002)
-"""Searched frequencies, Hz. The first 26 s of a trial are at rest."""
+"""Frequencies for the search of the sawtooth, Hz. The first 26 s of a trial are at rest."""
 
 
 def all_trials(data: Path) -> list[Result]:
-    """Return the largest error over its standard deviation for each trial and length of window."""
+    """Largest ratio of error to standard deviation, for each trial and window length."""
     figures = []
     for path in sorted((data / "broad").glob("*.hdf5")):
         recording = whole(data, path.stem)
@@ -57,8 +58,9 @@ def all_trials(data: Path) -> list[Result]:
 def stamp_sawtooth(recording: Recording) -> tuple[float, float]:
     r"""Return the period, s, and the height, ms, of the sawtooth error of the sensor's stamps.
 
-    A stamp error e(t) adds :math:`\dot g(t) e(t)` to the residual of the lag fit. Its first
-    harmonic is fitted by least squares; a sawtooth of height A has the amplitude :math:`A / \pi`.
+    A stamp error e(t) adds :math:`\dot g(t) e(t)` to the residual of the lag fit. The first
+    harmonic of the error is fitted by least squares. A sawtooth of height A has the amplitude
+    :math:`A / \pi`.
     """
     imu = rates_from_gyro(recording.t_ns, recording.gyro, 0)
     ref = rates_from_orientations(recording.t_ns, recording.optical, 0)
@@ -68,7 +70,8 @@ def stamp_sawtooth(recording: Recording) -> tuple[float, float]:
     t_s, omega = ref.t_s[inside], ref.w[inside]
     g = np.stack([np.interp(at[inside], imu.t_s, imu.w[:, k]) for k in range(3)], axis=1)
 
-    # the residual along the angular acceleration is the local stamp error times its square
+    # The residual along the angular acceleration is the local stamp error times the squared
+    # acceleration.
     residual = g - omega - np.mean(g - omega, axis=0)
     slope = np.gradient(_smooth(omega, ref), ref.period_s, axis=0)
     pull, weight = np.sum(slope * residual, axis=1), np.sum(slope**2, axis=1)
@@ -84,7 +87,7 @@ def stamp_sawtooth(recording: Recording) -> tuple[float, float]:
 
 
 def _smooth(omega: np.ndarray, rates: Rates) -> np.ndarray:
-    """Return rates without noise above 20 Hz, so that their slope is the motion's."""
+    """Return the rates without noise above 20 Hz, so their slope is the slope of the motion."""
     width = round(0.025 / rates.period_s) | 1
     kernel = np.hanning(width + 2)
     kernel /= kernel.sum()

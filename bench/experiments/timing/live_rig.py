@@ -1,4 +1,4 @@
-"""Arrival stamps under load, and every stamp of a live rig through restarts."""
+"""Errors of arrival stamps under load, and of every stamp of a live rig through restarts."""
 
 from __future__ import annotations
 

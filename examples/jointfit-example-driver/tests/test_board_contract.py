@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class TextDevice:
-    """Device that is no board: it sends text."""
+    """Device of another type, which sends text."""
 
     def __init__(self, link: Path) -> None:
         self._line = PtyLine(link)

@@ -1,4 +1,4 @@
-"""Installation by colcon."""
+"""Configuration of the installation with colcon."""
 
 from setuptools import setup
 

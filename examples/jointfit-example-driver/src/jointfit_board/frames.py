@@ -1,4 +1,4 @@
-"""Codec of the board's frames: bytes to numbers and back; no port, no clock, no units.
+"""Codec of the board's frames: bytes to numbers and back, without port, clock and units.
 
  0    1    2         3 .. 6      7 .. 14                          15
 | A5 | 5A | counter | time, us | w x y z, int16, little-endian  | sum of bytes 2..14 mod 256 |
@@ -16,9 +16,9 @@ from jointfit_protocols.resynchronizing_codec import ResynchronizingCodec
 SIZE = 16
 """Length of a frame, bytes."""
 SCALE = 32767
-"""Counts of 1 in the quaternion."""
+"""Number of counts for 1 in the quaternion."""
 _HEAD = b"\xa5\x5a"
-_START = re.compile(rb"\xa5(?:\x5a|\Z)")  # a lone A5 at the end of the input may be a beginning
+_START = re.compile(rb"\xa5(?:\x5a|\Z)")  # A5 at the end may begin a frame
 _BODY = struct.Struct("<BI4h")
 
 
@@ -29,7 +29,7 @@ class BoardFrame(NamedTuple):
     time_us: int
     counts: tuple[int, int, int, int]
     end: int = 0
-    """Number of bytes fed to the codec up to the end of the frame, for back-dating."""
+    """Number of bytes that the codec received up to the end of the frame, for back-dating."""
     size: int = SIZE
     """Number of bytes on the wire."""
 

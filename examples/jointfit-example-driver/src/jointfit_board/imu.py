@@ -1,4 +1,4 @@
-"""Driver for one board: `BoardDecoder` is pure; `BoardImu.run` opens, starts and reads."""
+"""Driver for one board: `BoardDecoder` is pure; `BoardImu.run` opens, starts and reads it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Decoded
 
 _LISTEN_S = 0.3
-"""Time to receive the first frame, s: thirty periods."""
+"""Time limit for the first frame, s. It is thirty sample periods."""
 
 
 class BoardSettings(SerialImuSettings):
@@ -27,7 +27,7 @@ class BoardSettings(SerialImuSettings):
 
 
 class BoardDecoder(SerialDecoder[BoardFrame]):
-    """Converts chunks to samples in SI units with canonical orientation; no I/O."""
+    """Converts chunks to samples in SI units with canonical orientation, without I/O."""
 
     def __init__(self, settings: BoardSettings) -> None:
         clock = TickClock(tick_ns=1000, modulus=1 << 32)
@@ -35,9 +35,9 @@ class BoardDecoder(SerialDecoder[BoardFrame]):
         super().__init__(board_codec(), samples, settings.line_baud, longest=SIZE)
 
     def convert(self, message: BoardFrame, arrival_ns: int) -> list[Decoded]:
-        """Return the sample of one frame, after the checks of its norm, time and counter."""
+        """Return the sample of one frame after checks of its norm, time and counter."""
         w, x, y, z = (count / SCALE for count in message.counts)
-        q = (w, x, y, z)  # sensor to east-north-up, scalar first: canonical already
+        q = (w, x, y, z)  # sensor to east-north-up, scalar first, is canonical
         sample = ImuSample(
             arrival_ns=arrival_ns,
             q_world_sensor=q,
@@ -63,13 +63,13 @@ class BoardImu:
         return BoardDecoder(self._settings)
 
     async def run(self, emit: Emit) -> None:
-        """Open the port, start the board unless it already sends, and read until cancelled."""
+        """Open the port, start the board if it does not send, and read until cancelled."""
         settings = self._settings
         with SerialPort(settings.port, settings.baud) as port:
-            port.flush_input()  # the system buffers a few kilobytes of an earlier run
+            port.flush_input()  # the system stores some bytes of an earlier run
             conversation = SerialConversation(port, emit, board_codec)
 
-            # read before you write: the board may be sending already
+            # Read before writing, because the board may already be sending.
             first = await conversation.receive(_is_frame, _LISTEN_S)
             if first is None:
                 first = await conversation.ask(b"S", _is_frame, tries=2, wait_s=_LISTEN_S)

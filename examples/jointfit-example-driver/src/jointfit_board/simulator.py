@@ -1,6 +1,6 @@
-"""Virtual board on a pty, for the tests.
+"""Virtual board on a pseudo-terminal (pty), for the tests.
 
-Like the real board, it is silent until it receives the start command.
+Like the real board, it sends nothing until it receives the start command.
 
 Invariant: driver and simulator share the codec only.
 """
@@ -28,7 +28,7 @@ class BoardDevice:
     link
         Symbolic link to the host's port.
     streaming
-        Whether the board sends already.
+        Whether the board already sends.
     wire_noise
         Noise applied to each frame to the host.
     """
@@ -44,7 +44,7 @@ class BoardDevice:
         self.unplug, self.plug = self._line.unplug, self._line.plug
 
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
-        """Send one sample now, if the board was started."""
+        """Send one sample now if the board was started."""
         self._counter += 1
         if self.streaming:
             w, x, y, z = (round(part * SCALE) for part in q_world_sensor)
@@ -53,7 +53,7 @@ class BoardDevice:
             self.sent += self._line.write(self._noise(encode(frame)))
 
     async def run(self) -> None:
-        """Serve until cancelled."""
+        """Run the board until cancelled."""
         await self._line.serve(self._receive)
 
     def _receive(self, data: bytes) -> None:

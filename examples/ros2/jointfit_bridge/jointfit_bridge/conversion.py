@@ -1,24 +1,24 @@
 """Converts a payload of ``pose`` to joint angles and transforms with the conventions of ROS.
 
-The module imports nothing of ROS and can be tested without it.
+The module does not import ROS, so it can be tested without ROS.
 
-REP 103: SI units and radians; the world is ENU (x east, y north, z up), as that of jointfitd. The
-axes of a body are x forward, y left, z up; a segment of jointfitd has x to the right, y forward,
-z up. Quaternions of ROS have the scalar last. REP 105: every frame is a child of the fixed frame
-`world`, so that a segment without data affects no other frame.
+Units are SI and radians (REP 103). The world is ENU (x east, y north, z up), as in jointfitd. The
+axes of a ROS body are x forward, y left, z up. A segment of jointfitd has x to the right, y
+forward, z up. Quaternions of ROS have the scalar last. Every frame is a child of the fixed frame
+`world` (REP 105), so a segment without data affects no other frame.
 """
 
 from math import radians, sqrt
 from typing import Any, NamedTuple
 
 ANGLES = ("flexion", "adduction", "rotation", "plane", "elevation", "bending")
-"""Names of anatomical angles; a joint has three of them."""
+"""Names of anatomical angles. A joint has three of these angles."""
 _Q_SEGMENT_BODY = (sqrt(0.5), 0.0, 0.0, sqrt(0.5))
-"""Axes of ROS in those of a segment, scalar first: a turn by +90 degrees about z."""
+"""Rotation from the axes of ROS to the axes of a segment, scalar first: +90 degrees about z."""
 
 
 class Stamp(NamedTuple):
-    """Instant in UNIX time."""
+    """Time stamp in UNIX time."""
 
     sec: int
     nanosec: int
@@ -30,9 +30,9 @@ class JointAngles(NamedTuple):
     stamp: Stamp
     names: list[str]
     positions: list[float]
-    """Angles, rad."""
+    """Joint angles, rad."""
     velocities: list[float]
-    """Rates, rad/s; empty if one of them is unknown."""
+    """Angular rates, rad/s; empty if a rate is unknown."""
 
 
 class SegmentTransform(NamedTuple):
@@ -44,20 +44,20 @@ class SegmentTransform(NamedTuple):
     translation: tuple[float, float, float]
     """Origin of the segment, its proximal joint centre, in the world, m."""
     rotation: tuple[float, float, float, float]
-    """Body to world, (x, y, z, w)."""
+    """Rotation from body to world, (x, y, z, w)."""
 
 
 def stamp_of(pose: dict[str, Any]) -> Stamp:
-    """Return the instant of a pose."""
+    """Return the time stamp of a pose."""
     seconds, microseconds = divmod(pose["t_us"], 1_000_000)
     return Stamp(seconds, 1000 * microseconds)
 
 
 def joint_angles(pose: dict[str, Any]) -> JointAngles:
-    """Return the known angles of all joints, named ``JOINT_ANGLE``, as ``knee_flexion``.
+    """Return the known angles of all joints, with names ``JOINT_ANGLE`` such as ``knee_flexion``.
 
-    Signs are anatomical (flexion positive), not those of a robot model. Unknown angles are left
-    out, because a message has no value for them.
+    Signs are anatomical (flexion is positive) and may differ from a robot model. Unknown angles are
+    omitted, because a message has no value for them.
     """
     names, positions, rates = [], [], []
     for joint, values in pose["joints"].items():
@@ -117,5 +117,5 @@ def _product(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float, 
         aw * bz + ax * by - ay * bx + az * bw,
     )
     w, x, y, z = q
-    norm = sqrt(w * w + x * x + y * y + z * z)  # payloads have five decimals
+    norm = sqrt(w * w + x * x + y * y + z * z)  # payloads have only five decimals
     return (w / norm, x / norm, y / norm, z / norm)

@@ -1,4 +1,4 @@
-"""Builds the messages of ROS; the classes are arguments, so that this module imports none."""
+"""Builds ROS messages. The classes are arguments, so this module does not import ROS."""
 
 from array import array
 from collections.abc import Iterable
@@ -8,7 +8,7 @@ from jointfit_bridge.conversion import JointAngles, SegmentTransform, Stamp
 
 
 def joint_state(kinds: Any, angles: JointAngles) -> Any:
-    """Return a ``sensor_msgs/JointState``; `kinds` has the message classes as attributes."""
+    """Return a ``sensor_msgs/JointState``; the attributes of `kinds` are message classes."""
     return kinds.JointState(
         header=_header(kinds, angles.stamp, ""),
         name=angles.names,

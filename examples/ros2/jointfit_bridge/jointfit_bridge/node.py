@@ -1,4 +1,4 @@
-"""The node: subscribes to MQTT and publishes ``joint_states`` and ``/tf``."""
+"""ROS node that subscribes to MQTT and publishes ``joint_states`` and ``/tf``."""
 
 import json
 from types import SimpleNamespace
@@ -34,7 +34,7 @@ class Bridge:
     Parameters
     ----------
     node
-        An ``rclpy`` node; its parameters are `host`, `port`, `base`, `topic` and `world`.
+        An ``rclpy`` node with the parameters `host`, `port`, `base`, `topic` and `world`.
     kinds
         Message classes, from `message_kinds`.
     """
@@ -68,10 +68,10 @@ class Bridge:
 
 
 def mqtt_client(bridge: Bridge) -> Any:
-    """Return a client that connects, and again after each loss, once its loop is started."""
+    """Return a client whose loop connects, and reconnects after each loss."""
     import paho.mqtt.client as mqtt
 
-    version = getattr(mqtt, "CallbackAPIVersion", None)  # paho 1 of Ubuntu has none
+    version = getattr(mqtt, "CallbackAPIVersion", None)  # paho 1 (Ubuntu) has none
     client = mqtt.Client() if version is None else mqtt.Client(version.VERSION2)
     client.on_connect, client.on_message = bridge.on_connect, bridge.on_message
     client.connect_async(bridge.host, bridge.port)
