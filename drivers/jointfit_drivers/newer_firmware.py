@@ -1,9 +1,10 @@
-"""Detection of a device that is newer than the descriptions that its codec follows.
+"""Detection of devices that are newer than the descriptions on which their codec is based.
 
 Two signs indicate newer firmware: the version that the device reports, and well-formed contents of
-unknown kind or length. Both signs cause warnings only: contents that a codec decodes remain in use.
+unknown kind or length. Both signs only cause warnings. Contents that the codec can decode are still
+used.
 
-Invariant: the output depends only on the calls; no clock and no port is read.
+Invariant: the output depends only on the calls. The module reads no clock and no port.
 """
 
 from __future__ import annotations
@@ -18,21 +19,22 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Decoded
 
 _SIGHTINGS = 10
-"""Unknown contents of one kind after which a warning is returned. Fewer prove nothing, because a
-weak checksum accepts some corrupt messages."""
+"""Number of unknown contents of one kind that causes a warning. Fewer prove nothing, because a weak
+checksum accepts some corrupt messages."""
 _WITHIN_NS = 60_000_000_000
-"""Longest time between the first and the last of these contents, ns."""
+"""Longest time between the first and the last of these contents for a warning, ns."""
 _MOST_KINDS = 16
-"""Most kinds of unknown contents that are counted and reported."""
+"""Largest number of kinds of unknown contents that are counted and reported."""
 _NUMBER = re.compile(r"\d{1,9}")
 
 
 @dataclass(frozen=True, slots=True)
 class NewestKnown:
-    """Newest version of a family that the codec supports, and the program that installs it."""
+    """Newest version that the codec of a family supports, and the program that installs it."""
 
     version: tuple[int, ...]
-    """Leading numbers of the version; the vendor changes further ones without changing contents."""
+    """Leading numbers of the version. The vendor changes the other numbers without changing
+    contents."""
     tool: str
     """Program of the vendor that selects outputs and installs firmware."""
     part: str = "firmware"
@@ -40,22 +42,22 @@ class NewestKnown:
 
     @property
     def text(self) -> str:
-        """Version as text; numbers behind the known ones are ``x``."""
+        """Version as text, with ``x`` in place of numbers that do not matter."""
         return ".".join(map(str, self.version)) + (".x" if len(self.version) == 1 else "")
 
 
 class NewerFirmwareDetector:
-    """Reports of one device that it is newer than known.
+    """Warns that one device is newer than the supported versions.
 
     Parameters
     ----------
     newest : NewestKnown, optional
-        Newest known version; None if devices of the family report no comparable version.
+        Newest supported version; None if devices of the family report no comparable version.
     tool : str
-        Program that selects the outputs, for devices without `newest`.
+        Program that selects the outputs, for devices for which `newest` is None.
     sightings : int
-        Unknown contents of one kind after which a warning is returned; 1 on a connection without
-        errors.
+        Number of unknown contents of one kind that causes a warning. Use 1 for a connection without
+        transmission errors.
     """
 
     def __init__(
@@ -71,11 +73,11 @@ class NewerFirmwareDetector:
 
     @property
     def is_settled(self) -> bool:
-        """Whether every kind of unknown contents so far was reported."""
+        """Whether all kinds of unknown contents received so far were reported."""
         return all(count >= self._sightings for count, _ in self._seen.values())
 
     def take_version(self, found: str) -> list[Decoded]:
-        """Return a warning, once a version, if the device reports a newer one than known."""
+        """Return a warning, once per version, if the device reports a newer version."""
         self._found = found
         newest = self._newest
         if newest is None or found == self._reported:
@@ -92,7 +94,7 @@ class NewerFirmwareDetector:
         return [DeviceEvent("warning", text, self._data())]
 
     def take_unknown(self, content: str, t_ns: int) -> list[Decoded]:
-        """Return a warning, once, if contents of a kind that the codec does not know repeat.
+        """Return a warning, once, if contents of an unknown kind are repeated.
 
         Parameters
         ----------
@@ -119,7 +121,7 @@ class NewerFirmwareDetector:
         return [DeviceEvent("warning", text, {"unknown": content, **self._data()})]
 
     def _data(self) -> dict[str, object]:
-        """Return the version found and the newest known one, each if it exists."""
+        """Return the reported version and the newest supported version, if they are known."""
         newest = None if self._newest is None else self._newest.text
         known = {"found": self._found or None, "newest_known": newest}
         return {key: value for key, value in known.items() if value is not None}

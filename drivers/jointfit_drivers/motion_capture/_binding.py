@@ -38,25 +38,25 @@ MOST_NAMED = 50
 _MOST_COMPARED = 500
 """Largest number of server names that are compared with a misspelled name."""
 _MOST_SUGGESTED = 3
-"""Misspelt names for which a similar one is suggested."""
+"""Largest number of misspelled names for which a similar name is suggested."""
 _MOST_LISTED = 200
-"""Names of markers or bodies that an event lists; the count in its text is exact."""
+"""Largest number of names of markers or bodies in one event. The count in its text is exact."""
 
 
 class ModelEntry(NamedTuple):
     """One marker or body of the server's model."""
 
     key: ColumnKey
-    """Identity in the frames of the server."""
+    """Identity of the marker or body in the frames of the server."""
     owner: str
-    """Model or set of the entry; empty for a rigid body."""
+    """Name of the model or set that contains the entry; empty for a rigid body."""
     name: str
     member: int
-    """Number in its owner, from 1."""
+    """Number of the entry in its owner, from 1."""
 
     @property
     def aliases(self) -> tuple[str, ...]:
-        """Spellings besides the plain name."""
+        """Permitted spellings of the name in addition to the plain name."""
         if not self.owner:
             return ()
         joined = tuple(f"{self.owner}{mark}{self.name}" for mark in "/:_")
@@ -65,7 +65,7 @@ class ModelEntry(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ColumnBinding:
-    """Columns of the frames, until the model changes."""
+    """Columns of the frames. They are valid until the model changes."""
 
     layout: MocapLayout
     markers: tuple[ColumnKey, ...]
@@ -73,13 +73,13 @@ class ColumnBinding:
     bodies: tuple[ColumnKey, ...]
     """Key of each body column."""
     warnings: tuple[str, ...]
-    """Warnings: unknown names of rig.toml, and names that are ambiguous."""
+    """Warnings about unknown and ambiguous names in rig.toml."""
     unknown: tuple[str, ...]
-    """Names of rig.toml without a column."""
+    """Names in rig.toml for which there is no column."""
 
 
 def wanted_names(settings: MocapSettings) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the markers and the bodies that rig.toml names, and the key of each."""
+    """Return the markers and bodies that rig.toml names, each with its key in rig.toml."""
     markers = {
         name: f"markers.{part}" for part, names in settings.markers.items() for name in names
     }
@@ -93,14 +93,14 @@ def bind_columns(
     wanted_markers: Mapping[str, str],
     wanted_bodies: Mapping[str, str],
 ) -> ColumnBinding:
-    """Return the columns for the markers and bodies of a model.
+    """Return the columns for the markers and bodies of a server's model.
 
     Parameters
     ----------
     markers, bodies : sequence of ModelEntry
-        Content of the server's latest description.
+        Entries of the server's most recent description.
     wanted_markers, wanted_bodies : mapping of str to str
-        Names in rig.toml, and the key of each.
+        Names in rig.toml, each with its key.
     """
     of_markers = _columns("marker", markers, wanted_markers)
     of_bodies = _columns("rigid body", bodies, wanted_bodies)
@@ -116,18 +116,18 @@ def bind_columns(
 def renew_columns(
     before: ColumnBinding | None, binding: ColumnBinding, unpublished: int = 0
 ) -> tuple[ColumnBinding, list[DeviceEvent]]:
-    """Return a new binding, and its events: its columns if they changed, and new warnings.
+    """Return a new binding, with events for changed columns and new warnings.
 
-    Equal columns keep the layout object of the binding before.
+    If the columns have not changed, the new binding uses the same layout object as `before`.
 
     Parameters
     ----------
     before : ColumnBinding, optional
-        The binding in force until now.
+        Binding that was used so far; None for the first binding.
     binding : ColumnBinding
-        The binding from now on.
+        Binding that is used from now on.
     unpublished : int
-        Frames that arrived before the first model.
+        Number of frames that arrived before the first model.
     """
     layout = binding.layout
     listed = list(layout.markers[:_MOST_LISTED])
@@ -165,7 +165,7 @@ def _columns(what: str, entries: Sequence[ModelEntry], wanted: Mapping[str, str]
         for spelling in entry.aliases:
             alias[spelling].append(entry)
 
-    # Entries that rig.toml uses already are no suggestion for another name.
+    # Entries that rig.toml already uses are not suggested for another name.
     used_by_rig = {
         entry.name for name in wanted for entry in plain.get(name) or alias.get(name) or []
     }
@@ -212,7 +212,7 @@ def _columns(what: str, entries: Sequence[ModelEntry], wanted: Mapping[str, str]
 def _unused_name(
     entry: ModelEntry, plain: Mapping[str, list[ModelEntry]], used: set[str]
 ) -> str | None:
-    """Return the plain name if it is unique, otherwise one with its owner; None if all are used."""
+    """Return the plain name if it is unique, or a name with its owner; None if all are used."""
     full = f"{entry.owner}/{entry.name}" if entry.owner else entry.name
     choices = [entry.name] if len(plain[entry.name]) == 1 else []
     choices += [full, f"{full}#{entry.member}", f"{full}#{entry.key}"]

@@ -1,6 +1,7 @@
-"""Frame numbers and stamps of one server: lost, repeated, late and restarted frames.
+"""Detection of lost, repeated, late and restarted frames of one server by number and stamp.
 
-Invariant: pure. A frame number that no camera can have reached is a restart, never a loss.
+Invariant: the module is pure. A step of the frame number that no camera system can reach is a
+restart, never a loss.
 """
 
 from __future__ import annotations
@@ -8,14 +9,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 _REORDERED = 100
-"""Frames by which a number may decrease in a reordered datagram; more is a restart or a loop."""
+"""Largest decrease of the number of a reordered datagram. More is a restart or a loop."""
 _FASTEST_HZ = 2000
-"""Upper limit of the frame rate of camera systems, Hz: a larger step of the number is not due to
+"""Upper limit of the frame rate of camera systems, Hz. A larger step of the number is not caused by
 lost frames."""
 _BURST = 2000
-"""Frames that may arrive at once, from a queue that was emptied."""
+"""Largest number of frames that may arrive at once, from a queue that was emptied."""
 _LATE_RUN = 10
-"""Consecutive late frames that are no reordering but a short loop of a recording."""
+"""Number of consecutive late frames that are no reordering, but a short loop of a recording."""
 
 
 class FrameStep(NamedTuple):
@@ -37,25 +38,25 @@ class FrameContinuity:
         self._ticks = self._arrival_ns = 0
         self._late_run = 0
         self.duplicates = 0
-        """Number of frames dropped because they had the number of the preceding frame."""
+        """Number of frames dropped because they had the number of the previous frame."""
         self.late = 0
-        """Frames dropped because a later one had arrived."""
+        """Number of frames dropped because a later frame had already arrived."""
 
     def forget(self) -> None:
-        """Start again with the next frame."""
+        """Discard the state, so that the next frame is treated as the first."""
         self._number = None
 
     def frame(self, number: int, ticks: int, arrival_ns: int) -> FrameStep:
-        """Return the step for one frame.
+        """Return the classification of one frame.
 
         Parameters
         ----------
         number : int
             Frame number as sent.
         ticks : int
-            A stamp of the server that increases with every frame.
+            Stamp of the server that increases with every frame.
         arrival_ns : int
-            Host time of its arrival, ns.
+            Host time at which the frame arrived, ns.
         """
         step = _NEXT
         if self._number is not None:

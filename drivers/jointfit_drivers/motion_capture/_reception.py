@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     Connect = Callable[[Emit], Coroutine[Any, Any, None]]
 
 CHECK = "mocap"
-"""Subject of the findings."""
+"""Subject of all findings in this module."""
 FRAMES_S = 1.0
-"""Time to receive after the first frame, s."""
+"""Duration of the reception after the first frame, s."""
 
 
 async def run_until(
@@ -33,18 +33,18 @@ async def run_until(
     *,
     further_s: float = 0.0,
 ) -> DeviceLostError | DeviceMisconfiguredError | None:
-    """Run a connection; return the error of the device that ended it.
+    """Run a connection for a limited time; return the device error that ended it, if any.
 
     Parameters
     ----------
     connection : coroutine
-        Cancelled at the end.
+        Connection to run. It is cancelled at the end.
     arrived : asyncio.Event
-        Set when the expected data have arrived.
+        Event that is set when the expected data have arrived.
     limit_s : float
-        Longest wait for it, s.
+        Longest wait for the expected data, s.
     further_s : float
-        Time after it, s.
+        Duration of the connection after their arrival, s.
     """
     running = asyncio.create_task(connection, name="connection")
     waiting = asyncio.create_task(arrived.wait(), name="expected data")
@@ -64,14 +64,15 @@ async def run_until(
 
 
 class Reception:
-    """Everything that a server sent, decoded.
+    """Receives and decodes everything that a server sends.
 
     Parameters
     ----------
     decoder : Decoder
         A new decoder.
     connect : callable
-        Connects as the driver does, and passes every chunk to its argument.
+        Function that connects in the same way as the driver, and passes every chunk to its
+        argument.
     """
 
     def __init__(self, decoder: Decoder, connect: Connect) -> None:
@@ -80,24 +81,24 @@ class Reception:
         self.events: list[DeviceEvent] = []
         self.frames: list[MocapFrame] = []
         self.failure: DeviceLostError | DeviceMisconfiguredError | None = None
-        """Error that ended the connection."""
+        """Error that ended the connection; None if there was none."""
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings of the decoder, each once."""
+        """Warnings of the decoder, without repetitions."""
         texts = [event.text for event in self.events if event.kind in ("warning", "error")]
         return list(dict.fromkeys(texts))
 
     @property
     def facts(self) -> dict[str, object]:
-        """Description of the server."""
+        """Facts that describe the server."""
         found: dict[str, object] = {}
         for event in self.events:
             found |= event.data if event.kind == "info" else {}
         return found
 
     async def receive(self, limit_s: float) -> None:
-        """Receive until `FRAMES_S` after the first frame, at most for `limit_s`."""
+        """Receive until `FRAMES_S` after the first frame, but for at most `limit_s`."""
         arrived = asyncio.Event()
 
         def take(chunk: Chunk) -> None:
@@ -121,11 +122,11 @@ def content_findings(
     settings : MocapSettings
         The ``[mocap]`` table.
     reception : Reception
-        At least one frame.
+        Reception with at least one frame.
     name : str
         Name of the server.
     remedy : str
-        Where the camera software selects the streamed markers and bodies.
+        Place in the camera software where the streamed markers and bodies are selected.
     """
     frames = reception.frames
     layout = frames[-1].layout
@@ -147,18 +148,18 @@ def content_findings(
 def tracking_findings(
     settings: MocapSettings, frames: Sequence[MocapFrame], name: str, remedy: str
 ) -> list[Finding]:
-    """Return a finding for each rigid body of rig.toml that no frame contains.
+    """Return a finding for each rigid body in rig.toml that no frame contains.
 
     Parameters
     ----------
     settings : MocapSettings
         The ``[mocap]`` table.
     frames : sequence of MocapFrame
-        At least one frame.
+        Received frames, at least one.
     name : str
         Name of the server.
     remedy : str
-        How the camera software shows the definition of a body.
+        Instruction for displaying the definition of a body in the camera software.
     """
     findings = []
     bodies = frames[-1].layout.bodies
@@ -173,7 +174,7 @@ def tracking_findings(
 
 
 def summary(frames: Sequence[MocapFrame], name: str) -> Finding:
-    """Return the rate and the content of frames without a fault."""
+    """Return a finding that states rate and content of the frames if there is no fault."""
     layout, span_s = frames[-1].layout, (frames[-1].arrival_ns - frames[0].arrival_ns) / 1e9
     rate = f"{(len(frames) - 1) / span_s:.0f} frames a second, " if span_s > 0 else ""
     content = f"{rate}{len(layout.bodies)} rigid bodies, {len(layout.markers)} markers"

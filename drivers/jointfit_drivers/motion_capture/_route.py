@@ -1,4 +1,4 @@
-"""Address of a server, and the network card towards it."""
+"""Network route to a server: its address, and the network card of this host."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ async def host_address(name: str) -> str:
     Raises
     ------
     OSError
-        The name is unknown.
+        The name cannot be resolved.
     """
     try:
         found = await asyncio.get_running_loop().getaddrinfo(name, None, family=socket.AF_INET)
@@ -44,16 +44,16 @@ async def find_route(kind: str, settings: ServerSettings) -> Route:
     Parameters
     ----------
     kind : str
-        Name of the family for messages, such as ``NatNet``.
+        Name of the device family for messages, such as ``NatNet``.
     settings : ServerSettings
-        The table.
+        The ``[mocap]`` table.
 
     Raises
     ------
     DeviceLostError
-        The host is unknown, or there is no route to it.
+        The host name is unknown, or there is no route to the host.
     DeviceMisconfiguredError
-        The network card is unknown.
+        The configured network card does not exist.
     """
     name, interface = settings.server, settings.interface
     try:

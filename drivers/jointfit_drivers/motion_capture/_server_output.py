@@ -1,4 +1,4 @@
-"""Chunks of a server, and whether its frames have stopped."""
+"""Output of a server's chunks, and detection that its frames have stopped."""
 
 from __future__ import annotations
 
@@ -10,27 +10,28 @@ if TYPE_CHECKING:
 
 
 class ServerOutput:
-    """Emits what a server sends, from one connection of a driver to the next.
+    """Emits the chunks of a server, across all connections of a driver.
 
-    After a silence, or a connection with answers but without a frame, answers are emitted with
-    the first frame: a server that only answers is no source of data, and is reported once.
+    If frames have stopped, or a connection has answers but no frame, answers are not emitted before
+    the next frame. A server that only answers is therefore no source of data, and its loss is
+    reported only once.
     """
 
     def __init__(self) -> None:
         self.silent = False
-        """Whether frames have stopped and none has arrived since, in any connection."""
+        """Whether frames have stopped and none has arrived since then, in any connection."""
         self._answered = self._framed = False
         self._held: list[Chunk] = []
 
     def begin(self, emit: Emit) -> None:
-        """Begin a connection, whose chunks `emit` receives."""
+        """Begin a connection whose chunks are passed to `emit`."""
         self._emit = emit
         self.silent |= self._answered and not self._framed
         self._answered = self._framed = False
         self._held.clear()
 
     def emit_frame(self, chunk: Chunk) -> None:
-        """Emit a chunk with a frame, after the answers before it."""
+        """Emit a chunk that contains a frame, after the answers that arrived before it."""
         self.silent, self._framed = False, True
         for held in self._held:
             self._emit(held)
@@ -38,7 +39,7 @@ class ServerOutput:
         self._emit(chunk)
 
     def emit_answer(self, chunk: Chunk) -> None:
-        """Emit a chunk without frames; after a silence, with the first frame."""
+        """Emit a chunk without frames. If frames have stopped, emit it with the next frame."""
         self._answered = True
         if self.silent:
             self._held.append(chunk)

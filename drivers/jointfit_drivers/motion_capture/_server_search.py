@@ -1,4 +1,4 @@
-"""Search for servers at several addresses."""
+"""Combination of searches for servers at several addresses."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
 
 
 async def gather_servers(named: Sequence[Search], searched: Sequence[Search]) -> list[FoundServer]:
-    """Return the servers that several searches find, each once, by address.
+    """Return the servers that several searches find, without repetitions, sorted by address.
 
     Parameters
     ----------
     named : sequence of coroutines
-        Searches at named hosts, whose answers also contain the names of markers and bodies.
+        Searches at named hosts. Their answers also contain the names of markers and bodies.
     searched : sequence of coroutines
-        Searches in networks, where a named host answers as well.
+        Searches in networks. A named host may answer them as well.
     """
     async with asyncio.TaskGroup() as group:
         tasks = [group.create_task(search) for search in (*named, *searched)]

@@ -1,4 +1,4 @@
-"""Keys of rig.toml that all motion-capture servers of a network share."""
+"""Keys of rig.toml that all motion-capture servers on a network have."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from jointfit_daemon.driver import (
 )
 
 _DOTTED = re.compile(r"\d+(\.\d+){2,}")
-"""Numbers that are meant as an IPv4 address."""
+"""Pattern of text that is probably meant as an IPv4 address."""
 
 
 def _address(text: str) -> IPv4Address | None:
@@ -26,7 +26,10 @@ def _address(text: str) -> IPv4Address | None:
 
 
 class ServerSettings(MocapSettings):
-    """A ``[mocap]`` table with the address of a server; families derive from this."""
+    """A ``[mocap]`` table with the address of a server.
+
+    The tables of device families derive from it.
+    """
 
     server: str = Field(description="address or name of the PC that runs the camera software")
     interface: str | None = Field(
@@ -39,7 +42,7 @@ class ServerSettings(MocapSettings):
     @field_validator("server")
     @classmethod
     def _server_with_a_name(cls, server: str) -> str:
-        """Refuse text that is neither an address nor a host name."""
+        """Reject text that is neither an address nor a host name."""
         if ":" in server:
             raise ValueError("expected an IPv4 address or a name, without port")
         if (fault := host_fault(server)) is not None:
@@ -53,7 +56,7 @@ class ServerSettings(MocapSettings):
     @field_validator("interface")
     @classmethod
     def _interface_that_can_exist(cls, interface: str | None) -> str | None:
-        """Refuse a value that is neither an address nor a name that the kernel allows."""
+        """Reject text that is neither an address nor a name that the kernel permits."""
         if interface is not None and not is_interface_name(interface):
             raise ValueError(f"{INTERFACE_NAME_EXPECTED}; or an IPv4 address")
         if interface is not None and _DOTTED.fullmatch(interface) and not _address(interface):

@@ -1,7 +1,7 @@
-"""Sockets to one server in the event loop.
+"""Sockets to one server, which are read in the event loop.
 
-The event loop calls the readers, so they cannot raise an error in the driver's coroutine. Their
-error is stored, and `SocketLink.pause`, in which the coroutine waits, raises it.
+The event loop calls the readers, so the readers cannot raise an error in the driver's coroutine. An
+error of a reader is stored. The coroutine waits in `SocketLink.pause`, which raises the error.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class OpenSocket(Protocol):
-    """Socket of `jointfit_drivers.ports`."""
+    """Interface of the sockets in `jointfit_drivers.ports`."""
 
     def fileno(self) -> int:
         """Return the file descriptor."""
@@ -26,7 +26,10 @@ class OpenSocket(Protocol):
 
 
 class SocketLink:
-    """Sockets that are read until the link ends; the links of the families derive from this."""
+    """Sockets that are read until the link ends.
+
+    The links of device families derive from this class.
+    """
 
     def __init__(self) -> None:
         self._loop = asyncio.get_running_loop()
@@ -43,21 +46,21 @@ class SocketLink:
             opened.close()
 
     def watch(self, opened: OpenSocket, read: Callable[[], None]) -> None:
-        """Call `read` when data arrive at a socket; the link closes the socket at its end."""
+        """Call `read` whenever data arrive at a socket. The link closes the socket at its end."""
         self._sockets.append(opened)
         self._loop.add_reader(opened, self._call, read)
 
     def wake(self) -> None:
-        """End the current `pause`: a message arrived."""
+        """End the current `pause`, because a message arrived."""
         self._arrived.set()
 
     def fail(self, error: Exception) -> None:
-        """Make `pause` raise `error`, unless it raises an earlier one."""
+        """Make `pause` raise `error`, unless an earlier error is already stored."""
         self._failure = self._failure or error
         self._arrived.set()
 
     async def pause(self, seconds: float) -> None:
-        """Wait for `wake`, at most `seconds`; raise errors of the readers."""
+        """Wait until `wake` is called, but at most `seconds`; raise errors of the readers."""
         if seconds > 0 and self._failure is None:
             with suppress(TimeoutError):
                 async with asyncio.timeout(seconds):

@@ -1,6 +1,6 @@
-"""TCP connection to a server in the event loop.
+"""TCP connection to a server, which is read in the event loop.
 
-Failures of the network are raised as `DeviceLostError`, other exceptions unchanged.
+Network failures are raised as `DeviceLostError`. Other exceptions are raised unchanged.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 CONNECT_S = 3.0
 """Longest wait for a connection, s."""
 _MOST_READS = 16
-"""Reads at one wake-up, so that other sources are served, too."""
+"""Largest number of reads per wake-up, so that other sources are processed as well."""
 
 
 class TcpLink(SocketLink):
@@ -29,11 +29,11 @@ class TcpLink(SocketLink):
     Parameters
     ----------
     name : str
-        Name of the server for messages, with its port.
+        Name and port of the server, for messages.
     remedy : str
-        Advice for the case that no program listens.
+        Advice that is displayed if no program listens on the port.
     take : callable
-        Called with all received bytes, in order of arrival.
+        Function that is called with all received bytes in the order of arrival.
     """
 
     def __init__(self, name: str, remedy: str, take: Callable[[ReceivedBytes], None]) -> None:
@@ -44,12 +44,12 @@ class TcpLink(SocketLink):
         self._connection: TcpConnection | None = None
 
     async def open(self, route: Route, port: int) -> None:
-        """Connect, and begin to read.
+        """Connect to the server, and begin to read.
 
         Raises
         ------
         DeviceLostError
-            The server refuses, does not answer or cannot be reached.
+            The server refuses the connection, does not answer, or cannot be reached.
         """
         try:
             connection = await TcpConnection.open(

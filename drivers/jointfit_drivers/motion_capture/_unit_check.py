@@ -1,27 +1,27 @@
-"""Detection of a wrong unit by the size of the coordinates.
+"""Detection of a wrong unit of length from the size of the coordinates.
 
-Camera volumes are smaller than 50 m, and a body rarely stays within 20 mm of the origin.
+Camera volumes are smaller than 50 m, and a tracked body rarely stays within 20 mm of the origin.
 
-Invariant: pure; at most one text.
+Invariant: the module is pure, and returns at most one warning.
 """
 
 from __future__ import annotations
 
 _LARGEST_M = 50.0
-"""Coordinate, m, that no camera volume has."""
+"""Coordinate that exceeds every camera volume, m."""
 _SMALLEST_MM = 20.0
-"""Distance from the origin, mm, that tracked bodies exceed."""
+"""Distance from the origin that tracked bodies exceed sooner or later, mm."""
 _REPORTS = 500
-"""Reports after which coordinates in mm have exceeded `_SMALLEST_MM`."""
+"""Number of positions within which coordinates in mm have exceeded `_SMALLEST_MM`."""
 
 
 class UnitCheck:
-    """Checks the first reports of a server.
+    """Checks the first positions of a server.
 
     Parameters
     ----------
     unit : str
-        ``m`` or ``mm``, as configured.
+        Configured unit, ``m`` or ``mm``.
     """
 
     def __init__(self, unit: str) -> None:
@@ -30,7 +30,7 @@ class UnitCheck:
         self._reports = 0
 
     def feed(self, x: float, y: float, z: float) -> str | None:
-        """Return the warning for a position as sent; None without a new one."""
+        """Return a warning for a position, given as sent; None if there is no new warning."""
         if self._reports > _REPORTS:
             return None
         largest = max(abs(x), abs(y), abs(z))

@@ -1,7 +1,8 @@
-"""Positions and orientations of a frame: world z up, unit quaternions, NaN for missing data.
+"""Conversion of positions and orientations to a world with z up; missing data become NaN.
 
-The **world** is rotated, p' = R p and q' = q_R q. The axes of a body remain the axes of the vendor.
-Positions that are not finite or not plausible, and orientations that are no rotation, are absent.
+The **world** is rotated: p' = R p and q' = q_R q. The axes of a body remain as the vendor defines
+them. Positions that are not finite or not plausible count as missing. So do orientations that are
+not rotations.
 """
 
 from __future__ import annotations
@@ -21,18 +22,18 @@ if TYPE_CHECKING:
     Turn = Callable[[float, float, float, float], Quaternion]
 
 UpAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
-"""Axis of the stream that points up."""
+"""Axis of the vendor's world that points up."""
 
 NO_POSITION: Vector = (math.nan, math.nan, math.nan)
 NO_ORIENTATION: Quaternion = (math.nan, math.nan, math.nan, math.nan)
 ABSENT = (NO_POSITION, NO_ORIENTATION)
-"""Pose of a body that the cameras do not see."""
+"""Pose of a body that is not visible to the cameras."""
 NORM_TOLERANCE = 1e-3
 """Largest deviation of a quaternion's norm from 1."""
 FARTHEST_M = 10_000.0
-"""Largest plausible coordinate, m; NaN compares as larger."""
+"""Largest plausible coordinate, m. Comparisons treat NaN as larger."""
 _MATRIX_TOLERANCE = 1e-2
-"""Largest row sum of |RᵀR - I|."""
+"""Largest row sum of the absolute elements of RᵀR - I."""
 _LEAST_DETERMINANT = 0.5
 _HALF = math.sqrt(0.5)
 
@@ -43,7 +44,7 @@ def world_rotation(up_axis: str) -> tuple[Place, Turn]:
     Parameters
     ----------
     up_axis : UpAxis
-        The stream's axis that points up.
+        Axis of the vendor's world that points up.
     """
     return _WORLDS[up_axis]
 
@@ -54,7 +55,7 @@ def is_near(x: float, y: float, z: float) -> bool:
 
 
 def unit_quaternion(w: float, x: float, y: float, z: float) -> Quaternion | None:
-    """Return the normalized quaternion; None if its norm is not 1 within `NORM_TOLERANCE`."""
+    """Return the normalized quaternion; None if its norm differs from 1 by `NORM_TOLERANCE`."""
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     if not abs(norm - 1.0) <= NORM_TOLERANCE:
         return None
@@ -62,17 +63,17 @@ def unit_quaternion(w: float, x: float, y: float, z: float) -> Quaternion | None
 
 
 def matrix_quaternion(r: Sequence[float]) -> Quaternion | None:
-    """Return the quaternion of a rotation matrix; None if the matrix is no rotation.
+    """Return the quaternion of a rotation matrix; None if the matrix is not a rotation.
 
     Parameters
     ----------
     r : sequence of 9 floats
-        Matrix by rows. Accepted if ‖RᵀR - I‖∞ < 1e-2 and det R > 0.5; the quaternion is normalized.
+        Matrix by rows. It is accepted if ‖RᵀR - I‖∞ < 1e-2 and det R > 0.5.
     """
     a, b, c, d, e, f, g, h, i = r
     ab, ac, bc = a * b + d * e + g * h, a * c + d * f + g * i, b * c + e * f + h * i
     aa, bb, cc = a * a + d * d + g * g - 1, b * b + e * e + h * h - 1, c * c + f * f + i * i - 1
-    # NaN compares as false, so the conditions are written for acceptance.
+    # Comparisons with NaN are false, so the conditions describe acceptance, not rejection.
     orthogonal = (
         abs(aa) + abs(ab) + abs(ac) < _MATRIX_TOLERANCE
         and abs(ab) + abs(bb) + abs(bc) < _MATRIX_TOLERANCE
@@ -122,6 +123,6 @@ _WORLDS: dict[str, tuple[Place, Turn]] = {
     ),
     "-z": (lambda x, y, z: (x, -y, -z), lambda w, x, y, z: (-x, w, -z, y)),
 }
-"""Rotation of the world that makes z up, for each up axis: by 90° about y or x, by 180° about x.
-Applied to positions, and from the left to quaternions.
+"""Rotation of the world that makes z up, for each up axis: 90° about y or x, or 180° about x. It is
+applied to positions, and multiplied from the left to quaternions.
 """

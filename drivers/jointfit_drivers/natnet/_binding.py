@@ -1,13 +1,14 @@
-"""Binding of the ids in frames to the names in rig.toml.
+"""Assignment of the ids in frames to the names in rig.toml.
 
-A labeled marker has id ``model << 16 | member``. The model is a rigid body, a skeleton or an asset.
-The name of its member is, in this order: the marker name in the description (bitstream 4.0 on), the
-name at that place in the marker set of the model's name, or ``Marker1``, ``Marker2`` and so on.
-Markers of a set without a model are identified by set and place; the set ``all`` repeats others.
+A labeled marker has the id ``model << 16 | member``. The model is a rigid body, a skeleton or an
+asset. The name of a member is the marker name in the description (bitstream 4.0 and later). Without
+it, the name is that of the marker at the same position in the marker set with the model's name, or
+else ``Marker1``, ``Marker2`` and so on. Markers of a set without a model are identified by set and
+position. The set ``all`` is ignored, because it repeats the other sets.
 
-Names of columns: `jointfit_drivers.motion_capture.bind_columns`.
+`jointfit_drivers.motion_capture.bind_columns` defines the names of the columns.
 
-Invariant: pure; only names matter, not ids and orders.
+Invariant: the module is pure. Only names matter; ids and orders do not.
 """
 
 from __future__ import annotations
@@ -38,30 +39,30 @@ _MEMBER = (1 << _MEMBER_BITS) - 1
 
 @dataclass(frozen=True, slots=True)
 class Binding:
-    """Columns of the frames, until the model changes."""
+    """Columns of the frames. They are valid until the model changes."""
 
     columns: ColumnBinding
     known: frozenset[ColumnKey]
-    """Every id in the model, refused ones included."""
+    """All ids in the model, including ids that are not accepted."""
     loose_sets: frozenset[str]
-    """Marker sets whose positions are read from the sets themselves."""
+    """Names of marker sets whose positions are read directly from the sets."""
 
 
 def bind_model(
     model: natnet.ModelDefinition, markers: Mapping[str, str], bodies: Mapping[str, str]
 ) -> Binding:
-    """Return the columns for a model.
+    """Return the columns for a model of the server.
 
     Parameters
     ----------
     model : ModelDefinition
-        The server's latest description.
+        Most recent description from the server.
     markers, bodies : mapping of str to str
-        Names in rig.toml, and the key of each.
+        Names in rig.toml, each with its key.
     """
     shared, shared_bodies = _shared_ids(model, _MODELS), _shared_ids(model, natnet.BodyDescription)
 
-    # All bodies, with those inside skeletons and assets.
+    # All rigid bodies, including those inside skeletons and assets.
     all_bodies: list[ModelEntry] = []
     for item in model.descriptions:
         if isinstance(item, natnet.BodyDescription):
@@ -91,7 +92,7 @@ def bind_model(
 
 
 def body_key(owner: int, member: int) -> int:
-    """Return the id in frames of a bone, or of a body or marker of an asset."""
+    """Return the id that a bone, or a body or marker of an asset, has in frames."""
     return owner << _MEMBER_BITS | (member & _MEMBER)
 
 
@@ -134,7 +135,7 @@ def _members(model: int, owner: str, names: Iterable[str]) -> list[ModelEntry]:
 def _shared_ids(
     model: natnet.ModelDefinition, kinds: type | UnionType
 ) -> dict[ColumnKey, list[str]]:
-    """Return the ids that several models of these kinds have, and the names of the models."""
+    """Return the ids that several models of these kinds use, with the names of the models."""
     names: defaultdict[ColumnKey, list[str]] = defaultdict(list)
     for item in model.descriptions:
         if isinstance(item, kinds) and isinstance(item, _MODELS):

@@ -1,10 +1,10 @@
-"""Bitstream version of one NatNet server, changed only by a datagram that confirms the new one.
+"""Bitstream version of one NatNet server, which changes only if a datagram confirms the change.
 
-An announced version is a candidate. The candidate is adopted when a frame or a model cannot be
-decoded with the version in use and decodes exactly with the candidate. A forged announcement alone
-therefore changes nothing.
+A version that the server announces is a candidate. The candidate is used from the first frame or
+model that decodes exactly with it, but not with the version in use. A forged announcement therefore
+changes nothing.
 
-Invariant: pure.
+Invariant: the module is pure.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ if TYPE_CHECKING:
 
 UNKNOWN: Version = (0, 0)
 _MOST_LAYOUTS = 64
-"""Lengths of frames whose layouts are stored."""
+"""Largest number of stored layouts of frames, one per length."""
 FRAME_START = int(NatNetMessageId.FRAMEOFDATA).to_bytes(2, "little")
-"""First bytes of a datagram with a frame, in every bitstream."""
+"""First bytes of a datagram that contains a frame, in every bitstream version."""
 
 
 class BitstreamTracker:
-    """Decodes datagrams with the version in use and tracks its changes.
+    """Decodes datagrams with the version in use, and detects changes of the version.
 
     Parameters
     ----------
     wanted : tuple of int, optional
-        Version that rig.toml requests from the server; always a candidate.
+        Version that rig.toml requests from the server. It is always a candidate.
     """
 
     def __init__(self, wanted: Version | None = None) -> None:
@@ -46,9 +46,10 @@ class BitstreamTracker:
         self._announced: Version | None = None
         self._confirmed: Version | None = None
         self._layouts: dict[tuple[Version, int], FrameLayout] = {}
-        """Layout of the last frame with this version and length; a server sends few lengths."""
+        """Layout of the last frame for each version and length. Frames of a server have few
+        lengths."""
         self._selected: frozenset[str] | None = None
-        """Marker sets that are read from frames of a known layout; None for all."""
+        """Marker sets that are read from frames with a known layout; None for all sets."""
 
     @property
     def known(self) -> bool:
@@ -56,28 +57,28 @@ class BitstreamTracker:
         return self.version != UNKNOWN
 
     def announce(self, version: Version) -> None:
-        """Process the version of a SERVERINFO: the first is used, later versions are candidates."""
+        """Process the version in a SERVERINFO. The first is used; later versions are candidates."""
         self._announced = version
         if not self.known or not supported(self.version):
             self.version = version
 
     def confirm(self, version: Version) -> None:
-        """Add the version of a RESPONSE as a candidate."""
+        """Add the version in a RESPONSE as a candidate."""
         self._confirmed = version
 
     def select_sets(self, names: frozenset[str]) -> None:
-        """Leave out the other marker sets, and unlabeled markers, where it saves time."""
+        """Skip other marker sets and unlabeled markers if this saves time."""
         if names != self._selected:
             self._selected = names
             self._layouts.clear()
 
     def restart(self, version: Version) -> None:
-        """Use the version of another server at the same address."""
+        """Use the version of a different server at the same address."""
         self.version = self._announced = version
         self._confirmed = None
 
     def decode(self, datagram: bytes) -> Message | CorruptBytes:
-        """Return the message in `datagram`; adopt a candidate that alone decodes it."""
+        """Return the message in `datagram`. If only a candidate can decode it, use that version."""
         key = self.version, len(datagram)
         layout = self._layouts.get(key)
         if layout is not None:

@@ -1,10 +1,11 @@
-"""Decoder of the NatNet driver: datagrams in, optical frames and clock echoes out.
+"""Decoder of NatNet servers: converts datagrams to optical frames and clock echoes.
 
-A capture contains datagrams of both directions. Datagrams of a client have no effect, except that
-the arrival of an echo request is the sending time of the answer. A frame that arrives before its
-model is counted in `unpublished` and dropped. Every number is checked against its range before use.
+A capture contains datagrams in both directions. Datagrams from a client have no effect, except that
+the arrival of an echo request is the sending time for its answer. A frame that arrives before the
+model is dropped and counted in `unpublished`. Every number is checked against its range before it
+is used.
 
-Invariant: the output depends only on the chunks fed; the decoder reads no clock and no socket.
+Invariant: the output depends only on the chunks fed. The decoder reads no clock and no socket.
 """
 
 from __future__ import annotations
@@ -29,14 +30,15 @@ if TYPE_CHECKING:
     from jointfit_drivers.natnet._settings import NatNetSettings
 
 _ECHO_LIMIT_NS = 10**9
-"""Age of an echo answer, ns, after which it is useless for the clock."""
+"""Largest age of an echo answer for which it is used for the clock, ns."""
 _PENDING_ECHOES = 8
 _NEWEST = NewestKnown((4, 2), "Motive", "NatNet")
-"""Newest bitstream that was described; sections of later ones are skipped by their size."""
+"""Newest bitstream version with a published description. Sections of later versions are skipped by
+their size."""
 _NAMED_UNKNOWN = 16
-"""Unknown ids that are listed in warnings; further ones are only counted."""
+"""Largest number of unknown ids in warnings. Further ids are only counted."""
 _MOST_SECONDS = 2**63 // 10**9
-"""Largest plausible stamp, s: its nanoseconds still fit 64 bits."""
+"""Largest plausible stamp, s, whose value in nanoseconds fits into 64 bits."""
 _ANNOUNCED = {
     natnet.FRAME_MODEL_CHANGED: "the model list changed",
     natnet.FRAME_BITSTREAM_CHANGED: "the bitstream version changed",
@@ -49,7 +51,7 @@ class NatNetDecoder:
     Parameters
     ----------
     settings : NatNetSettings
-        Names in rig.toml, up axis, and latency of cameras without exposure stamp.
+        The ``[mocap]`` table: names, up axis, and latency of cameras without exposure stamp.
     """
 
     def __init__(self, settings: NatNetSettings) -> None:
@@ -70,19 +72,19 @@ class NatNetDecoder:
         self.messages = 0
         """Number of well-formed messages of any kind so far."""
         self.discarded_bytes = 0
-        """Number of bytes in datagrams that contained no message."""
+        """Number of bytes in datagrams that contain no message."""
         self.unpublished = 0
-        """Frames that arrived before the model or the server's version was known."""
+        """Number of frames that arrived before the model or the server's version was known."""
         self.unknown_ids = 0
-        """Markers and bodies dropped because the model has no such id."""
+        """Number of markers and bodies dropped because the model does not contain their id."""
         self.suspicious = 0
-        """Poses, stamps and echoes rejected because their numbers are implausible."""
+        """Number of poses, stamps and echoes rejected because of implausible numbers."""
 
     @property
     def tick_clock(self) -> TickClock | None:
-        """The server's high-resolution counter, once its frequency is known and plausible.
+        """The server's high-resolution counter; None until a plausible frequency is known.
 
-        UNIX time where cameras on PTP stamp the frames.
+        The clock is UNIX time if the frames are stamped by cameras that PTP synchronizes.
         """
         if self._time.precise:
             return self._time.tick_clock
@@ -90,16 +92,16 @@ class NatNetDecoder:
 
     @property
     def duplicates(self) -> int:
-        """Number of frames dropped because they had the number of the preceding frame."""
+        """Number of frames dropped because they had the number of the previous frame."""
         return self._continuity.duplicates
 
     @property
     def late(self) -> int:
-        """Frames dropped because a later one had arrived."""
+        """Number of frames dropped because a later frame had already arrived."""
         return self._continuity.late
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return the content of one datagram; never raises."""
+        """Return the content of one datagram; never raise."""
         before = self._bitstream.version
         message = self._bitstream.decode(chunk.data)
         if isinstance(message, CorruptBytes):
@@ -124,7 +126,7 @@ class NatNetDecoder:
         return []
 
     def _take(self, chunk: Chunk, message: natnet.Message, out: list[Decoded]) -> None:
-        """Append the content of one message; messages of other clients have no content."""
+        """Append the content of one message. Messages of other clients have no content."""
         match message:
             case natnet.FrameOfData():
                 self._frame(chunk, message, out)
@@ -132,7 +134,7 @@ class NatNetDecoder:
                 self._server(message, out)
             case natnet.ModelDefinition():
                 self._model(message, out)
-            # echo request of a recorded client: the time at which it was sent
+            # The capture contains an echo request of a client. Its arrival is the sending time.
             case natnet.EchoRequest(stamp):
                 if len(self._asked) >= _PENDING_ECHOES:
                     del self._asked[next(iter(self._asked))]
@@ -149,7 +151,7 @@ class NatNetDecoder:
     def _server(self, info: natnet.ServerInfo, out: list[Decoded]) -> None:
         """Append the description of a new or changed server."""
         before = self._info
-        # An implausible frequency would make every stamp of the frames wrong.
+        # An implausible frequency would make the stamps of all frames wrong.
         self._info, self._hz = info, usable_hz(info)
 
         firmware = ".".join(map(str, info.application_version))
@@ -182,7 +184,7 @@ class NatNetDecoder:
             out.append(DeviceEvent("error", text, {"bitstream": name}))
 
     def _model(self, model: natnet.ModelDefinition, out: list[Decoded]) -> None:
-        """Bind the columns to a model; append its changes and the warnings about it."""
+        """Assign the columns to a model; append its changes and warnings."""
         binding = bind_model(model, self._wanted_markers, self._wanted_bodies)
         before = None if self._binding is None else self._binding.columns
         columns, events = renew_columns(before, binding.columns, self.unpublished)
@@ -198,7 +200,7 @@ class NatNetDecoder:
     # --- time ---------------------------------------------------------------------------------
 
     def _echo(self, chunk: Chunk, echo: natnet.EchoResponse, out: list[Decoded]) -> None:
-        """Append a plausible echo, for clocks that no PTP disciplines."""
+        """Append a plausible echo, unless PTP synchronizes the clock."""
         sent_ns = self._asked.pop(echo.stamp, echo.stamp)
         if self._time.precise or not 0 <= chunk.t_ns - sent_ns <= _ECHO_LIMIT_NS:
             return
@@ -210,7 +212,7 @@ class NatNetDecoder:
     # --- frames -------------------------------------------------------------------------------
 
     def _frame(self, chunk: Chunk, frame: natnet.FrameOfData, out: list[Decoded]) -> None:
-        """Append the frame in the columns of the model, after the events that it causes."""
+        """Append the frame in the columns of the model, after the events that the frame causes."""
         step = self._continuity.frame(frame.number, frame.transmit, chunk.t_ns)
         if not step.use:
             return
@@ -231,7 +233,7 @@ class NatNetDecoder:
         found = self._poses.columns(frame, binding)
         self.suspicious += found.suspicious
         if found.unknown:
-            # Warn of each unknown id once.
+            # Warn once about each unknown id.
             self.unknown_ids += len(found.unknown)
             new = [i for i in found.unknown if i not in self._named_unknown]
             if new and len(self._named_unknown) < _NAMED_UNKNOWN:
@@ -255,10 +257,9 @@ class NatNetDecoder:
         )
 
     def _exposure_ticks(self, frame: natnet.FrameOfData, out: list[Decoded]) -> int | None:
-        """Return the exposure in ticks of the clock in use.
+        """Return the instant of exposure in ticks of the clock in use.
 
-        The exposure is computed from the configured latency if the cameras do not stamp the
-        exposure.
+        If the cameras do not stamp the exposure, it is computed from the configured latency.
         """
         hz = self._hz
         if self._time.precise:
@@ -276,7 +277,7 @@ class NatNetDecoder:
         return max(0, frame.transmit - round(self._latency_ms * hz / 1000))
 
     def _announce(self, params: int, out: list[Decoded]) -> None:
-        """Append events for newly set flags of the frame."""
+        """Append events for flags that are newly set in a frame."""
         risen, self._announced = params & ~self._announced, params
         out += [DeviceEvent("setting", text) for bit, text in _ANNOUNCED.items() if risen & bit]
 

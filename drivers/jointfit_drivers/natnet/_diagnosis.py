@@ -1,16 +1,16 @@
-"""Diagnosis of "connected, but no data": the cause of missing frames, each with its remedy.
+"""Diagnosis of "connected, but no data": causes of missing frames, each with its remedy.
 
-The diagnosis connects as the driver does, receives for a while, and disconnects.
+The diagnosis connects in the same way as the driver, receives for a limited time, and disconnects.
 
 | cause | evidence |
 |---|---|
-| wrong interface or subnet | the route leaves by another card; no card has the server's network |
-| multicast on two interfaces | the frames arrive at another card than the one in use |
-| firewall | the server answers, and its multicast frames arrive at no card |
+| wrong interface or subnet | the route uses another card; no card has the server's network |
+| multicast on two interfaces | the frames arrive at another card than the card in use |
+| firewall | the server answers, but its multicast frames arrive at no card |
 | streaming off | the port is closed, or the server answers without sending frames |
-| no rigid body or marker set | the model of the stream is empty, or lacks names of rig.toml |
-| unknown bitstream | the announced version is newer than all known ones |
-| playback paused | frames are flagged as a recording, and their number stands still |
+| no rigid body or marker set | the stream's model is empty, or lacks names of rig.toml |
+| unknown bitstream | the announced version is newer than all supported versions |
+| playback paused | frames are flagged as a recording, and the frame number does not change |
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ if TYPE_CHECKING:
     from jointfit_drivers.natnet._settings import NatNetSettings
 
 _MULTICAST_S = 1.0
-"""Time to receive multicast frames at all network cards, s."""
+"""Duration of the reception of multicast frames at all network cards, s."""
 _NEWEST = "4.2"
-"""Newest bitstream with a description; sections of later ones are skipped by their size."""
+"""Newest bitstream version with a published description. Sections of later versions are skipped."""
 _STILL = 3
-"""Repeated frames from which the frame number stands still."""
+"""Number of repetitions from which the frame number counts as unchanged."""
 _STREAMING = (
     "in Motive's Streaming pane enable streaming and select the local interface of this network "
     "(not loopback); in playback, press play"
@@ -55,7 +55,7 @@ _STREAMING = (
 
 
 class NatNetReception(Reception):
-    """Everything that a server sent, decoded.
+    """Receives and decodes everything that a NatNet server sends.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class NatNetReception(Reception):
 
     def __init__(self, settings: NatNetSettings, route: Route) -> None:
         self.datagrams = 0
-        """Datagrams with a frame, decoded or not."""
+        """Number of datagrams that contain a frame, whether it was decoded or not."""
 
         async def connect(emit: Emit) -> None:
             def take(chunk: Chunk) -> None:
@@ -121,7 +121,7 @@ async def diagnose(settings: NatNetSettings, wait_s: float) -> list[Finding]:
 
 
 def _unanswered(settings: NatNetSettings, failure: Exception | None) -> Finding:
-    """Return the finding for a server without an answer to CONNECT."""
+    """Return the finding for a server that does not answer CONNECT."""
     name, port = settings.server, settings.command_port
     if isinstance(failure, DeviceMisconfiguredError):
         remedy = "set server and command_port in [mocap] to those in Motive's Streaming pane"
@@ -141,7 +141,7 @@ def _unanswered(settings: NatNetSettings, failure: Exception | None) -> Finding:
 async def _missing_frames(
     settings: NatNetSettings, route: Route, reception: NatNetReception
 ) -> list[Finding]:
-    """Return the findings for a server that answers, but sends no usable frame."""
+    """Return the findings for a server that answers but sends no usable frame."""
     name, server, failure = settings.server, reception.facts, reception.failure
     natnet = ".".join(str(server["natnet"]).split(".")[:2])
     major = int(natnet.partition(".")[0])
@@ -172,7 +172,7 @@ async def _missing_frames(
 async def _missing_multicast(
     settings: NatNetSettings, route: Route, server: dict[str, Any]
 ) -> Finding:
-    """Return whether the frames arrive at another card, or at none."""
+    """Return the finding that frames arrive at another card, or at no card."""
     host, local = route
     name, group = settings.server, str(server["group"])
     port = settings.data_port or int(server["data_port"])
@@ -197,7 +197,7 @@ async def _missing_multicast(
 
 
 def _stream_findings(settings: NatNetSettings, reception: NatNetReception) -> list[Finding]:
-    """Return the findings about the content of the stream."""
+    """Return the findings about the content of the stream of frames."""
     name, frames = settings.server, reception.frames
     layout = frames[-1].layout
     findings = []

@@ -1,8 +1,8 @@
 """Driver of OptiTrack Motive and other servers of NatNet 2.5 to 4.x, over UDP.
 
-`NatNetDecoder` is the pure part. `NatNetMocap.run` connects and emits every accepted datagram
-of the server, answers of the handshake included, so that a replay has the same input as the
-live decoder.
+`NatNetDecoder` is the pure part. `NatNetMocap.run` connects and emits every accepted datagram of
+the server. This includes the answers of the handshake, so a replay has the same input as the live
+decoder.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class NatNetMocap:
-    """One NatNet server: labeled markers and rigid bodies, stamped by its own clock."""
+    """One NatNet server: labeled markers and rigid bodies, stamped by the server's clock."""
 
     Settings: ClassVar[type[NatNetSettings]] = NatNetSettings
     wire: ClassVar[Wire] = "datagram"
@@ -43,11 +43,11 @@ class NatNetMocap:
         Raises
         ------
         DeviceLostError
-            The host is unknown, does not answer, has no listening server, sends no frame for
-            ``silence_s``, or another server has taken its place. A retry may succeed.
+            The host is unknown, does not answer, or has no listening server. Or the server sends no
+            frame for ``silence_s``, or was replaced by another server. A retry may succeed.
         DeviceMisconfiguredError
-            The host is no NatNet server, its bitstream is not supported, or the network card is
-            unknown.
+            The host is not a NatNet server, its bitstream is not supported, or the network card
+            does not exist.
         """
         route = await find_route("NatNet", self._settings)
         await NatNetSession(self._settings, route, emit, self._output).run()

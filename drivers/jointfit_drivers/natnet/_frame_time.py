@@ -1,6 +1,6 @@
 """Clock of the frame stamps, and the timecode of frames.
 
-Invariant: pure; the result depends only on the frames passed in.
+Invariant: the module is pure. The result depends only on the frames passed in.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ _UNIX = TickClock(1, None, None, "unix")
 
 
 class FrameTime:
-    """Reads precision timestamps if rig.toml selects them, and timecodes if there are any.
+    """Reads precision timestamps if rig.toml selects them, and reports timecodes.
 
     Parameters
     ----------
     settings : NatNetSettings
-        Selects the clock.
+        The ``[mocap]`` table, which selects the clock.
     """
 
     def __init__(self, settings: NatNetSettings) -> None:
@@ -35,16 +35,16 @@ class FrameTime:
 
     @property
     def precise(self) -> bool:
-        """Whether frames are stamped by PTP and the server's counter is ignored."""
+        """Whether PTP time stamps of the frames are used and the server's counter is ignored."""
         return self._precise is not None
 
     @property
     def tick_clock(self) -> TickClock | None:
-        """UNIX time in ns, once its representation in the frames is known."""
+        """UNIX time in ns; None until its representation in the frames is known."""
         return _UNIX if self._precise is not None and self._precise.decided else None
 
     def unix_ns(self, frame: FrameOfData, out: list[Decoded]) -> int | None:
-        """Return the frame's UNIX time; None if it has none, which is reported once."""
+        """Return the UNIX time of a frame; None if it has none, which is reported once."""
         precise = self._precise
         if precise is None:
             return None
@@ -60,7 +60,7 @@ class FrameTime:
         return None if found is None else found - self._ahead_ns
 
     def report_timecode(self, frame: FrameOfData, out: list[Decoded]) -> None:
-        """Report the timecode of the first frame that has one, and its loss."""
+        """Report the timecode of the first frame that has one, and report if it is lost."""
         code = timecode_of(frame)
         if (code is not None) == self._coded:
             return

@@ -1,9 +1,10 @@
-"""Sockets to one NatNet server in the event loop.
+"""Sockets to one NatNet server, which are read in the event loop.
 
-Failures of the network are raised as `DeviceLostError`, other exceptions unchanged.
+Network failures are raised as `DeviceLostError`. Other exceptions are raised unchanged.
 
-Frames are accepted from any port of the server, because multicast frames leave its data port.
-Control messages are accepted on the command socket only, and only from the server's command port.
+Frames are accepted from any port of the server, because multicast frames are sent from its data
+port. Control messages are accepted only on the command socket, and only from the server's command
+port.
 """
 
 from __future__ import annotations
@@ -30,15 +31,15 @@ if TYPE_CHECKING:
     from jointfit_protocols.natnet import Message
 
 _FLEETING = {errno.ENOBUFS, errno.EMSGSIZE, errno.EINTR}
-"""Errors that concern one datagram and not the connection."""
+"""Error numbers that concern one datagram and not the connection."""
 _FORGED_NS = 100_000_000
-"""Time, ns, after a datagram from the server for which an ICMP refusal is ignored.
+"""Time after a datagram from the server for which an ICMP refusal is ignored, ns.
 
-A server that has just sent a datagram does not refuse: the ICMP message is forged or stale."""
+A server that has just sent a datagram does not refuse, so the ICMP message is forged or stale."""
 
 
 class NatNetLink(SocketLink):
-    """Command socket, and a data socket for multicast frames.
+    """Command socket, and a second socket for multicast frames.
 
     Parameters
     ----------
@@ -47,7 +48,7 @@ class NatNetLink(SocketLink):
     port : int
         Command port of the server.
     take : callable
-        Called with every chunk from the server, in order of arrival.
+        Function that is called with every chunk from the server, in the order of arrival.
     """
 
     def __init__(self, route: Route, port: int, take: Callable[[Chunk], None]) -> None:
@@ -59,7 +60,7 @@ class NatNetLink(SocketLink):
         self.foreign = 0
         """Number of datagrams that this class dropped because of their source.
 
-        The kernel drops most datagrams of other hosts before, and these are not counted."""
+        The kernel drops most datagrams of other hosts earlier. They are not counted."""
 
     @override
     def __enter__(self) -> Self:
@@ -68,7 +69,7 @@ class NatNetLink(SocketLink):
         return self
 
     def join(self, group: str, port: int) -> None:
-        """Open the data socket of a multicast server; raises the system's OSError."""
+        """Open the data socket of a multicast server; raise OSError if this fails."""
         data = UdpSocket.in_group(group, port, self._local, sender=self._server[0])
         self.watch(data, partial(self._read, data))
 

@@ -1,4 +1,4 @@
-"""Network card towards a NatNet server: findings about its choice, and about lost multicast."""
+"""Findings about the network card that is used for a NatNet server, and about lost multicast."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ def card_findings(
     chosen: bool = False,
     arrived: bool = False,
 ) -> list[Finding]:
-    """Return the faults of the choice of the network card; pure.
+    """Return the faults in the choice of the network card; the function is pure.
 
     Parameters
     ----------
     name
-        Name of the server in rig.toml.
+        Name of the server as written in rig.toml.
     host, local
         Numeric addresses of the server and of the network card in use.
     routed
-        Address of the card that routes to the server; None without a route.
+        Address of the card that the kernel uses for the server; None if there is no route.
     cards
         Network cards of this host.
     chosen
-        Whether rig.toml names the card, so that several cards are no fault.
+        Whether rig.toml selects the card. In this case several cards are no fault.
     arrived
-        Whether frames arrive, so that several cards are only a risk.
+        Whether frames arrive. In this case several cards are only a risk.
     """
     names = {card.address: card.name for card in cards}
     used = next((card for card in cards if card.address == local), None)
@@ -82,7 +82,7 @@ def card_findings(
 async def multicast_arrivals(
     group: str, port: int, host: str, cards: Sequence[NetworkCard], wait_s: float
 ) -> dict[str, int]:
-    """Return the number of frames of a multicast group at each card, by its address."""
+    """Return the number of frames of a multicast group that arrive at each card, by address."""
     counts = {card.address: 0 for card in cards}
     with contextlib.ExitStack() as stack:
         opened = []

@@ -1,9 +1,9 @@
-"""Requests to a NatNet server that await an answer; they decide which datagrams are accepted.
+"""Requests to a NatNet server that wait for an answer; they decide which datagrams are accepted.
 
 UDP has no connections, and source addresses can be forged. A SERVERINFO, MODELDEF, RESPONSE or
-ECHORESPONSE that answers no open request is dropped.
+ECHORESPONSE is therefore dropped unless it answers an open request.
 
-Invariant: pure; host times are arguments.
+Invariant: the module is pure. Host times are passed as arguments.
 """
 
 from __future__ import annotations
@@ -25,11 +25,12 @@ if TYPE_CHECKING:
     from jointfit_protocols.natnet import Message
 
 ANSWER_NS = 5_000_000_000
-"""Age of a request, ns, after which its answer is dropped; as long as the wait for MODELDEF."""
+"""Age of a request above which its answer is dropped, ns; equal to the longest wait for
+MODELDEF."""
 ECHO_NS = 1_000_000_000
-"""Age of an echo request, ns, after which its answer is useless for the clock."""
+"""Age of an echo request above which its answer is not used for the clock, ns."""
 OPEN_ECHOES = 32
-"""Stored echo requests without an answer; the burst at connection sends ten."""
+"""Largest number of stored echo requests without answer. Ten are sent at the connection."""
 
 _REQUEST_OF_ANSWER = {
     NatNetMessageId.SERVERINFO: NatNetMessageId.CONNECT,
@@ -43,16 +44,19 @@ _REQUEST_IDS: dict[type, NatNetMessageId] = {
 
 
 class OpenRequests:
-    """Requests to the server without an answer so far."""
+    """Requests to the server that have no answer yet."""
 
     def __init__(self) -> None:
         self._asked_ns: dict[NatNetMessageId, int] = {}
         self._echoes: dict[int, None] = {}
         self.unsolicited = 0
-        """Messages dropped because they answered no open request."""
+        """Number of messages dropped because they answered no open request."""
 
     def register(self, message: Message, now_ns: int) -> None:
-        """Register a message sent at `now_ns`; the stamp of an echo is its sending time."""
+        """Register a message that was sent at `now_ns`.
+
+        The stamp of an echo is its sending time.
+        """
         if isinstance(message, EchoRequest):
             if len(self._echoes) >= OPEN_ECHOES:
                 del self._echoes[next(iter(self._echoes))]
@@ -64,13 +68,15 @@ class OpenRequests:
             self._asked_ns[kind] = now_ns
 
     def accept(self, datagram: bytes, now_ns: int) -> bool:
-        """Return whether a control datagram answers an open request, or needs none.
+        """Return whether a control datagram answers an open request, or does not need one.
 
-        The first answer closes the request. If it is unusable, the caller sends another request.
+        The first answer closes the request. If the answer is unusable, the caller sends a new
+        request.
         """
         kind = int.from_bytes(datagram[:2], "little") if len(datagram) >= HEADER.size else None
         if kind == NatNetMessageId.ECHORESPONSE:
-            # Each stamp is accepted once: a duplicate with other ticks would distort the clock.
+            # Each stamp is accepted only once, because a duplicate with other ticks would distort
+            # the clock.
             echo = decode(datagram, (0, 0))
             accepted = True  # malformed: counted as corrupt by the decoder
             if isinstance(echo, EchoResponse):

@@ -1,8 +1,9 @@
 """Conversion of one NatNet frame to columns: SI units, world z up, NaN for missing data.
 
-Missing data are marked by the server. A body whose bit 0 is clear repeats its last valid pose.
-A labeled marker is absent, or occluded with a plausible filled position. A position in a marker
-set is (0, 0, 0). A usable marker is not occluded **and** point-cloud solved.
+The server marks missing data. If bit 0 of a body is clear, the body repeats its last valid pose. A
+labeled marker that is not visible is absent, or it is flagged as occluded and has an estimated
+position. A missing position in a marker set is (0, 0, 0). A usable marker is not occluded **and**
+point-cloud solved.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ _QUALITY_BITS = MARKER_OCCLUDED | MARKER_POINT_CLOUD_SOLVED
 
 
 class FrameColumns(NamedTuple):
-    """Arrays of one `MocapFrame`, and the data left out of them."""
+    """Arrays of one `MocapFrame`, and the data that they do not contain."""
 
     markers: NDArray[np.float64]
     body_positions: NDArray[np.float64]
@@ -42,10 +43,10 @@ class FrameColumns(NamedTuple):
     residuals: NDArray[np.float64]
     """Residual of each labeled marker, m per camera ray; NaN if missing or zero."""
     suspicious: int
-    """Bodies rejected because their quaternion is not normalised or their numbers are not finite.
-    """
+    """Number of bodies rejected because of a quaternion that is not normalised or numbers that are
+    not finite."""
     unknown: tuple[int, ...]
-    """Ids that are not in the model."""
+    """Ids that the model does not contain."""
 
 
 class PoseConverter:
@@ -54,15 +55,15 @@ class PoseConverter:
     Parameters
     ----------
     up_axis : {"x", "y", "z"}
-        The stream's up axis. The **world** is rotated, p' = R p and q' = q_R q; the axes of a body
-        are the axes of the vendor.
+        Axis of the stream that points up. The **world** is rotated: p' = R p and q' = q_R q. The
+        axes of a body remain as the vendor defines them.
     """
 
     def __init__(self, up_axis: str) -> None:
         self._place, self._turn = world_rotation(up_axis)
 
     def columns(self, frame: FrameOfData, binding: Binding) -> FrameColumns:
-        """Return `frame` in the columns of `binding`."""
+        """Return the data of `frame` in the columns of `binding`."""
         unknown: list[int] = []
 
         place = self._place
@@ -104,7 +105,7 @@ class PoseConverter:
             if number not in known:
                 if number >> 16:  # model 0: a marker without a model
                     unknown.append(number)
-            # as is_near, which would take a third of the time of this loop
+            # The test equals is_near, whose call would take a third of the time of this loop.
             elif (
                 params & _QUALITY_BITS == MARKER_POINT_CLOUD_SOLVED
                 and -far <= x <= far

@@ -1,6 +1,6 @@
 """Checks whether the driver can work with a server, and their error messages.
 
-Invariant: pure. Every number of a SERVERINFO that is used later is checked here.
+Invariant: the module is pure. It checks every number of a SERVERINFO that other modules use.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ if TYPE_CHECKING:
 
 NEWEST_MAJOR = 4
 LEAST_CLOCK_HZ = 1_000
-"""Lowest usable frequency of the server's counter, Hz; a slower one stamps too coarsely."""
+"""Lowest usable frequency of the server's counter, Hz. A slower counter stamps too coarsely."""
 MOST_CLOCK_HZ = 100_000_000_000
-"""Highest plausible frequency, Hz: ten times the fastest processor counter."""
+"""Highest plausible frequency, Hz, which is ten times that of the fastest processor counter."""
 _PLAIN_FORM = 264
 _BITSTREAM_FORM = 271
 _LONGEST_VERSION = len("99.99")
 
 
 def connect_request(settings: NatNetSettings) -> Connect:
-    """Return the CONNECT to send: the form that real servers are known to answer.
+    """Return the CONNECT message to send, in the form that real servers answer.
 
-    Only a request for another bitstream of a unicast 4.x server has the form of the vendor's
-    sample.
+    Only a request for another bitstream from a unicast 4.x server has the form of the vendor's
+    sample program.
     """
     wanted = settings.wanted_version
     if wanted is None:
@@ -38,20 +38,21 @@ def connect_request(settings: NatNetSettings) -> Connect:
 
 
 def is_unicast(settings: NatNetSettings, info: ServerInfo) -> bool:
-    """Return whether frames arrive on the command socket."""
+    """Return whether the frames arrive on the command socket."""
     if settings.transport == "auto":
-        # Servers of bitstream 2.x announce no transport; multicast was the default of Motive.
+        # Servers with bitstream 2.x do not announce a transport. The default of Motive was
+        # multicast.
         return not info.multicast and info.bitstream >= TICKED
     return settings.transport == "unicast"
 
 
 def check_server(name: str, settings: NatNetSettings, info: ServerInfo) -> None:
-    """Refuse a server that cannot work with these settings.
+    """Reject a server that cannot work with these settings.
 
     Raises
     ------
     DeviceMisconfiguredError
-        The server is too old, too new, has no clock, or cannot change its bitstream in multicast.
+        The server is too old or too new, has no clock, or cannot change its bitstream in multicast.
     """
     found = f"{name} ({info.application}) uses NatNet {info.bitstream[0]}.{info.bitstream[1]}"
     if not supported(info.bitstream):
@@ -90,7 +91,7 @@ def usable_hz(info: ServerInfo) -> int | None:
 
 
 def check_group(name: str, info: ServerInfo, port: int) -> None:
-    """Refuse an invalid multicast address or port.
+    """Reject an invalid multicast address or port.
 
     Raises
     ------
@@ -109,12 +110,12 @@ def check_group(name: str, info: ServerInfo, port: int) -> None:
 
 
 def same_instance(a: ServerInfo, b: ServerInfo) -> bool:
-    """Return whether two answers are from the same server, its bitstream aside."""
+    """Return whether two answers come from the same server; their bitstream may differ."""
     return a._replace(natnet_version=b.natnet_version) == b
 
 
 def bitstream_response(text: str) -> Version | None:
-    """Return the version in a response ``Bitstream,x.y``; None if it is another response."""
+    """Return the version in a response ``Bitstream,x.y``; None for any other response."""
     command, *versions = text.split(",")
     if command != "Bitstream" or len(versions) != 1 or len(versions[0]) > _LONGEST_VERSION:
         return None

@@ -1,7 +1,7 @@
-"""Search for NatNet servers: DISCOVERY to a network, CONNECT to a named host.
+"""Search for NatNet servers: sends DISCOVERY to a network, and CONNECT to a named host.
 
-A named host is also asked for its model, so that the names of its rigid bodies and markers are
-known. Servers in unicast send frames after CONNECT; DISCONNECT ends them.
+The model of a named host is requested as well, because it contains the names of rigid bodies and
+markers. Servers in unicast mode send frames after CONNECT, until DISCONNECT is sent.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 COMMAND_PORT = 1510
-"""Usual command port of Motive."""
+"""Default command port of Motive."""
 _TRIES = 3
-"""Requests to a host or network, because a datagram may be lost."""
+"""Number of requests to a host or network, because datagrams may be lost."""
 _REQUEST = natnet.Connect(264, "jointfitd", (1, 0, 0, 0), (3, 0, 0, 0))
 
 
 class _Answers(asyncio.DatagramProtocol):
-    """Answers at one local address, by the server that sent them."""
+    """Answers received at one local address, by server."""
 
     def __init__(self) -> None:
         self.servers: dict[tuple[str, int], natnet.ServerInfo] = {}
@@ -51,7 +51,7 @@ class _Answers(asyncio.DatagramProtocol):
 
     @override
     def error_received(self, exc: Exception) -> None:
-        """Ignore refusals: the host does not answer."""
+        """Ignore refusals, because a host that refuses is no server."""
 
 
 async def find_servers(
@@ -68,7 +68,7 @@ async def find_servers(
 
 
 async def _ask_host(local: str, address: str, port: int, wait_s: float) -> list[FoundServer]:
-    """Return the server at an address with the names in its model; empty without an answer."""
+    """Return the server at an address with the names in its model; empty if it does not answer."""
     loop = asyncio.get_running_loop()
     transport, answers = await loop.create_datagram_endpoint(_Answers, local_addr=(local, 0))
     server = (address, port)
@@ -93,7 +93,7 @@ async def _ask_host(local: str, address: str, port: int, wait_s: float) -> list[
 
 
 async def _ask_network(local: str, address: str, port: int, wait_s: float) -> list[FoundServer]:
-    """Return the servers in the network of one card."""
+    """Return the servers that answer in the network of one card."""
     loop = asyncio.get_running_loop()
     transport, answers = await loop.create_datagram_endpoint(
         _Answers, local_addr=(local, 0), allow_broadcast=True

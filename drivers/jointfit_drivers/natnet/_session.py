@@ -1,16 +1,18 @@
 """One connection to a NatNet server, from CONNECT to silence.
 
-1. CONNECT every 0.5 s until SERVERINFO, which determines the data socket.
-2. REQUEST_MODELDEF every 0.5 s until MODELDEF: frames cannot be used without it.
-3. Frames; ten echo requests, 50 ms apart, then one a second, and in unicast one KEEPALIVE a second.
-   Frames before the tenth answer are unsynchronized.
+1. The session sends CONNECT every 0.5 s until SERVERINFO arrives, which determines the data socket.
+2. It sends REQUEST_MODELDEF every 0.5 s until MODELDEF arrives, because frames cannot be used
+   without the model.
+3. It receives frames. It sends ten echo requests at intervals of 50 ms, then one per second. In
+   unicast, it also sends one KEEPALIVE per second. Frames before the tenth echo answer are not
+   synchronized.
 
-Every accepted datagram is emitted, in order of arrival, so that a replay has the same input.
-The receiver of the chunks decodes the frames. This module reads only their flags, and decodes one
-frame a second to check that it can be decoded and that its ids are known.
+Every accepted datagram is emitted in the order of arrival, so that a replay has the same input. The
+receiver of the chunks decodes the frames. This module reads only their flags. Once per second it
+also decodes one frame, to check that this is possible and that the ids are known.
 
-Invariant: control messages are accepted as answers to open requests only (`OpenRequests`). If no
-frame of a server can be decoded, the server is lost, like a silent one.
+Invariant: control messages are accepted only as answers to open requests (`OpenRequests`). If the
+frames of a server cannot be decoded, the server counts as lost, as if it sent nothing.
 """
 
 from __future__ import annotations
@@ -47,27 +49,31 @@ if TYPE_CHECKING:
     from jointfit_drivers.natnet._settings import NatNetSettings
 
 RETRY_S = 0.5
-"""Interval between requests, s."""
+"""Interval between repetitions of a request, s."""
 CONNECT_S = 3.0
 """Longest wait for SERVERINFO, s."""
 MODEL_S = 5.0
 """Longest wait for MODELDEF, s."""
 FIRST_ECHOES, FIRST_ECHO_S = 10, 0.05
 ECHO_S = (0.8, 1.2)
-"""Range of the interval between echoes, s; random, so that they do not lock to the frame rate."""
+"""Range of the interval between echoes, s. It is random, so that echoes do not synchronize with the
+frame rate."""
 EVERY_S = 1.0
-"""Interval, s, between keep-alives, requests for a changed model, and checks of a whole frame."""
+"""Interval between keep-alive messages, between requests for a changed model, and between checks of
+a whole frame, s."""
 MISFITS = 3
-"""Consecutive frames that cannot be decoded before the server is asked for its bitstream again."""
+"""Number of consecutive undecodable frames after which the server is asked for its bitstream
+again."""
 
 _PARAMS = struct.Struct("<h")
 _PARAMS_FROM_END = 6
-"""Place of the flags: they and the end tag close every frame from bitstream 2.6 on."""
+"""Distance of the flags from the end, bytes. Flags and end tag end every frame from bitstream 2.6
+on."""
 _SHORTEST_FRAME = 4 + 50
 
 
 class NatNetSession:
-    """One connection; after a loss, a new one is made.
+    """One connection. After a loss, the driver creates a new session.
 
     Parameters
     ----------
@@ -76,9 +82,9 @@ class NatNetSession:
     route : Route
         Addresses of the server and of this host's network card.
     emit : Emit
-        Receives every accepted datagram of the server.
+        Function that receives every accepted datagram of the server.
     output : ServerOutput, optional
-        Output of the earlier connections.
+        Output that is shared with the earlier connections.
     """
 
     def __init__(
@@ -100,7 +106,7 @@ class NatNetSession:
         self._next_check_ns = self._frame_ns = 0
 
     async def run(self) -> None:
-        """Connect and read until cancelled; raises the errors of `NatNetMocap.run`."""
+        """Connect and read until cancelled. The errors are those of `NatNetMocap.run`."""
         with self._link as link:
             info = await self._connect()
             check_server(self._name, self._settings, info)
@@ -119,7 +125,7 @@ class NatNetSession:
                         )
                         raise DeviceLostError(f"{self._name}: {text}") from error
 
-                # The server's own bitstream is used if it refuses another one.
+                # If the server refuses the requested bitstream, its own bitstream is used.
                 if self._settings.wanted_version is not None:
                     asked = natnet.CommandRequest(f"Bitstream,{self._settings.bitstream}")
                     await self._request(asked, RETRY_S, lambda: self._confirmed)
@@ -134,7 +140,7 @@ class NatNetSession:
                     )
                 await self._stream(info, unicast)
             finally:
-                # Keep the exception that ended the connection.
+                # The exception that ended the connection must not be replaced by another one.
                 with contextlib.suppress(DeviceLostError):
                     link.send(natnet.Bare(NatNetMessageId.DISCONNECT))
 
@@ -197,7 +203,7 @@ class NatNetSession:
     async def _request(
         self, message: natnet.Message, within_s: float, answered: Callable[[], bool]
     ) -> None:
-        """Send `message` every half second until it is answered, at most for `within_s`."""
+        """Send `message` every half second until it is answered, for at most `within_s`."""
         until = time.monotonic() + within_s
         while not answered() and time.monotonic() < until:
             self._send(message)
@@ -254,7 +260,7 @@ class NatNetSession:
             await self._link.pause(min(due + [alive_at] * unicast) - now)
 
     def _check_alive(self, info: natnet.ServerInfo, unicast: bool, last_ns: int) -> None:
-        """Raise DeviceLostError without decodable frames, or if another server answers."""
+        """Raise DeviceLostError if no frame can be decoded, or if another server answers."""
         if self._info is not None and not same_instance(self._info, info):
             raise DeviceLostError(
                 f"{self._name}: restarted, or another server took its address "
@@ -264,8 +270,8 @@ class NatNetSession:
         if (time.monotonic_ns() - last_ns) / 1e9 < self._settings.silence_s:
             return
 
-        # The texts contain no measured duration: it would differ at every attempt, and every
-        # different text is a new line of the log.
+        # The text must not contain a measured duration. It would differ at every attempt, and every
+        # different text becomes a new line of the log.
         if self._misfits:
             version = "{}.{}".format(*self._bitstream.version)
             raise DeviceLostError(

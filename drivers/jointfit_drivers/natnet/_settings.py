@@ -42,7 +42,7 @@ class NatNetSettings(ServerSettings):
 
     @property
     def wanted_version(self) -> tuple[int, int] | None:
-        """`bitstream` as numbers."""
+        """The key `bitstream` as two numbers; None if it is not set."""
         if self.bitstream is None:
             return None
         major, minor = self.bitstream.split(".")
@@ -50,9 +50,9 @@ class NatNetSettings(ServerSettings):
 
     @property
     def usual_delay_ms(self) -> tuple[float, float] | None:
-        """Mean and standard deviation, ms, of the delay from exposure to arrival.
+        """Mean and standard deviation of the delay from exposure to arrival, ms.
 
-        The value applies to frames stamped by PTP. It is None for frames stamped by the server,
-        whose clock is measured by echoes.
+        The value applies to frames that PTP-synchronized cameras stamp. For frames that the server
+        stamps it is None, because echoes measure the server's clock.
         """
         return None if self.time == "server" else (self.latency_ms, self.latency_ms / 2)

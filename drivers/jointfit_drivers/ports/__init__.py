@@ -1,7 +1,7 @@
-"""Ports: serial ports, CAN buses and UDP sockets that stamp what arrives.
+"""Ports: serial ports, CAN buses and network sockets that stamp received data.
 
-Each kind of port is a module of its own (`serial_port`, `can_bus`, `udp_socket`), so that a driver
-imports only the libraries of the port it uses.
+Each type of port has a separate module (`serial_port`, `can_bus`, `udp_socket`, `tcp_connection`).
+A driver therefore imports only the libraries of the port that it uses.
 """
 
 __all__: list[str] = []

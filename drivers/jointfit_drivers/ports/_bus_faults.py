@@ -1,7 +1,7 @@
-"""Faults of a ``[can.NAME]`` table that python-can would report only when the bus is opened.
+"""Faults in a ``[can.NAME]`` table that python-can would report only when it opens the bus.
 
-The keys of an interface are the parameters of python-can's class, and those that its documentation
-names.
+The permitted keys of an interface are the parameters of python-can's class, and the parameters that
+its documentation describes.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
 _WINDOWS = frozenset({"etas", "iscan", "ixxat", "nican", "nixnet", "systec", "usb2can", "vector"})
-"""Interfaces of python-can whose libraries exist for Windows only."""
+"""Interfaces of python-can whose vendor libraries exist only for Windows."""
 _PACKAGES = {"neovi": "ics", "cantact": "cantact", "canalystii": "canalystii", "gs_usb": "usb"}
 """Python packages that python-can imports when a bus is opened, by interface."""
 _LIBRARIES = {"pcan": "libpcanbasic.so", "kvaser": "libcanlib.so", "neousys": "libwdt_dio.so"}
 """Libraries of vendors that python-can loads when a bus is opened, by interface."""
 _INSTEAD = 'set interface = "socketcan", or "slcan" for a serial adapter'
 _INTERNAL = frozenset({"self", "can_filters", "timing", "kwargs", "msg", "message"})
-"""Parameters of python-can that a table cannot contain, or that do not concern the opening of a
+"""Parameters of python-can that a table cannot contain, or that do not affect the opening of a
 bus."""
 _DOCUMENTED = re.compile(r":param (?:[\w.\[\]]+ )?(\w+):")
 _SPEEDS = ("baudrate", "ttyBaudrate")
-"""Names of python-can for the speed of a serial port."""
+"""Names that python-can uses for the speed of a serial port."""
 _RANGES = {
     "port": (1, 65_535),
     "hop_limit": (0, 255),
@@ -52,15 +52,15 @@ _RANGES = {
     "rx_queue_size": (0, 1 << 24),
     **dict.fromkeys(_SPEEDS, (SLOWEST_BAUD, FASTEST_BAUD)),
 }
-"""Smallest and largest value of keys of python-can, which does not check them itself."""
+"""Smallest and largest value of keys that python-can does not check itself."""
 _NUMBERS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
 
 
 def bus_faults(settings: CanBusSettings) -> dict[str, str]:
-    """Return the fault of each key of a table with which its bus can never be opened here.
+    """Return the faults of a table, by key, because of which its bus cannot be opened on this host.
 
-    Opens no device. The module of the interface is imported, because only this shows whether the
-    library of its vendor is installed.
+    No device is opened. The module of the interface is imported, because only the import shows
+    whether the vendor's library is installed.
     """
     kind = settings.interface
     if kind == "slcan":
@@ -91,7 +91,7 @@ def bus_faults(settings: CanBusSettings) -> dict[str, str]:
 
 @cache
 def _parameters(backend: type[can.BusABC]) -> dict[str, Any]:
-    """Return the keys of an interface and their default values, where python-can has one."""
+    """Return the keys of an interface with the default values that python-can defines."""
     documented = " ".join(filter(None, (getdoc(backend), getdoc(backend.__init__))))
     found: dict[str, Any] = dict.fromkeys(_DOCUMENTED.findall(documented))
     for name, parameter in signature(backend).parameters.items():
@@ -114,7 +114,7 @@ def _unknown_keys(settings: CanBusSettings, parameters: Collection[str]) -> dict
 
 
 def _wrong_values(settings: CanBusSettings, parameters: dict[str, Any]) -> dict[str, str]:
-    """Return keys of python-can with a value of another type than the default, or out of range."""
+    """Return the keys of python-can whose value has a wrong type or is out of range."""
     faults = {}
     for name, value in (settings.model_extra or {}).items():
         kind = type(parameters.get(name))
@@ -136,7 +136,7 @@ def _wrong_values(settings: CanBusSettings, parameters: dict[str, Any]) -> dict[
 
 
 def _wrong_choices(settings: CanBusSettings, backend: Any) -> dict[str, str]:
-    """Return keys whose values are not among the choices of an interface."""
+    """Return the keys whose values are not among the permitted choices of an interface."""
     extra, faults = settings.model_extra or {}, {}
     if settings.interface == "udp_multicast" and not _is_multicast(settings.channel):
         faults["channel"] = "expected a multicast address, such as '239.74.163.2'"
@@ -176,9 +176,9 @@ def _load_backend(kind: str) -> type[can.BusABC] | str:
 
 @contextmanager
 def _silent_import() -> Iterator[None]:
-    """Suppress what python-can's modules print and log when they are imported.
+    """Suppress output and log lines that python-can's modules write when they are imported.
 
-    The fault of the table contains the reason.
+    The reported fault of the table already contains the reason.
     """
     logger, printed = logging.getLogger("can"), StringIO()
     handler, propagate = logging.NullHandler(), logger.propagate
@@ -193,7 +193,7 @@ def _silent_import() -> Iterator[None]:
 
 
 def cannot_load(kind: str, error: object) -> str:
-    """Return the message for an interface whose library is missing."""
+    """Return the message for an interface whose library cannot be loaded."""
     return (
         f"CAN interface {kind!r} cannot be used here ({error}): install its library, or {_INSTEAD}"
     )

@@ -1,9 +1,10 @@
-"""Opening of buses of python-can by a thread, within a time limit, and a check of a CAN server.
+"""Opening of python-can buses in a thread with a time limit, and a check of a CAN server.
 
-Libraries of vendors may wait without end, and no call of a library can be interrupted. python-can
-connects to a socketcand server in a loop without a pause, and waits for its greeting without end.
+Vendor libraries may wait without limit, and a call of a library cannot be interrupted. python-can
+repeats the connection to a socketcand server in a loop without pauses, and waits for the server's
+greeting without limit.
 
-Invariant: at most one thread per bus is opening it, and no such thread delays the end of the
+Invariant: for each bus at most one thread is opening it, and no such thread delays the end of the
 process.
 """
 
@@ -29,38 +30,38 @@ class _Closable(Protocol):
 _Bus = TypeVar("_Bus", bound=_Closable)
 
 OPEN_S = 5.0
-"""Longest time for an opening, s: a vendor's library takes one or two."""
+"""Longest time for the opening of a bus, s. Vendor libraries need one or two seconds."""
 _SERVER_S = 1.5
 """Longest wait for the connection to a server, and for each answer, s."""
 _GREETING, _OPENED = "< hi >", "< ok >"
-"""Texts of a socketcand server: the greeting, and the answer to the opening of a bus."""
+"""Texts that a socketcand server sends: its greeting, and its answer after it opened a bus."""
 _LONGEST = 40
-"""Longest answer, bytes: enough to name another kind of server."""
+"""Longest answer that is read, bytes. It suffices to describe another type of server."""
 
 _opening: set[str] = set()
-"""Buses that a thread is opening."""
+"""Keys of the buses that a thread is currently opening."""
 
 
 async def open_in_thread(key: str, name: str, make: Callable[[], _Bus]) -> _Bus:
-    """Return the bus that `make` opens, within `OPEN_S`.
+    """Return the bus that `make` opens within `OPEN_S`.
 
-    A bus that opens after the limit, or after a cancellation, is closed again by its thread.
+    If the bus is opened after the limit or after a cancellation, the thread closes it again.
 
     Parameters
     ----------
     key : str
-        Identifies the bus among all calls.
+        Key that identifies the bus in all calls.
     name : str
-        The bus, as named in messages.
+        Name of the bus in messages.
     make : callable
-        Opens the bus; runs in a thread of its own.
+        Function that opens the bus; it runs in a separate thread.
 
     Raises
     ------
     DeviceLostError
-        The bus was not opened within the limit, or an earlier call for it has not ended.
+        The bus was not opened within the limit, or an earlier call for this bus is still running.
     Exception
-        Any exception of `make`.
+        Any exception that `make` raises.
     """
     too_long = DeviceLostError(
         f"{name}: not opened within {OPEN_S:g} s: restart its adapter or server, and check its "
@@ -77,7 +78,7 @@ async def open_in_thread(key: str, name: str, make: Callable[[], _Bus]) -> _Bus:
             loop.call_soon_threadsafe(ended.set)
 
     made.add_done_callback(wake)
-    # A daemon thread: the process does not wait for it at its end.
+    # The process does not wait for a daemon thread when it ends.
     _opening.add(key)
     run = threading.Thread(target=_make, args=(key, made, make), name=f"open {name}", daemon=True)
     run.start()
@@ -95,7 +96,7 @@ async def open_in_thread(key: str, name: str, make: Callable[[], _Bus]) -> _Bus:
 
 
 def _make(key: str, made: Future[_Bus], make: Callable[[], _Bus]) -> None:
-    """Set the result of `made`; close a bus for which no task waits any more."""
+    """Set the result of `made`. If no task waits for the bus any more, close it."""
     try:
         bus = make()
     except BaseException as error:  # noqa: BLE001 - handed to the task that waits
@@ -112,15 +113,16 @@ def _make(key: str, made: Future[_Bus], make: Callable[[], _Bus]) -> None:
 
 
 def require_socketcand(channel: str, host: str, port: int) -> None:
-    """Connect to a socketcand server, open `channel` there and disconnect.
+    """Connect to a socketcand server, open `channel` on it, and disconnect.
 
-    python-can would repeat a refused connection without pause for ten seconds, wait for answers
-    without end, and leave the connection open after a refusal.
+    The check is necessary because python-can would repeat a refused connection for ten seconds
+    without pauses, wait for answers without limit, and leave the connection open after a refusal.
 
     Raises
     ------
     DeviceLostError
-        No server accepts the connection, it does not answer as socketcand, or it refuses the bus.
+        No server accepts the connection, the answer is not that of socketcand, or the bus is
+        refused.
     """
     server = f"{channel}: socketcand server {host}:{port}"
     remedy = "start socketcand there, or correct host and port in its [can] table"
@@ -148,7 +150,7 @@ def require_socketcand(channel: str, host: str, port: int) -> None:
 
 
 def _receive_answer(connection: socket.socket) -> str:
-    """Return the next text up to ``>``; less after 40 bytes or at the end of the connection."""
+    """Return the next text up to ``>``; an incomplete text after 40 bytes or a disconnect."""
     text = b""
     while len(text) < _LONGEST and not text.endswith(b">"):
         received = connection.recv(_LONGEST)

@@ -1,6 +1,6 @@
-"""Conversion of the kernel's receive stamps of CAN frames to host monotonic nanoseconds.
+"""Conversion of the kernel's receive stamps of CAN frames to monotonic time of the host, ns.
 
-The kernel stamps the end of a frame, in UNIX seconds. The conversion returns its start.
+The kernel stamps the end of a frame in UNIX time. The conversion returns the start of the frame.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ _NS = 1_000_000_000
 
 
 class KernelStamps(WallClock):
-    """Converts the stamps of one bus; call `pair` at every wake-up.
+    """Converts the stamps of one bus. Call `pair` at every wake-up.
 
     Parameters
     ----------
     bitrate : int
         Bit rate of the bus, bit/s, which determines the duration of a frame.
     *clocks : callable
-        The two clocks of `WallClock`; replaced in tests.
+        The two clocks of `WallClock`, which tests replace.
     """
 
     def __init__(self, bitrate: int, *clocks: Callable[[], int]) -> None:
@@ -32,13 +32,13 @@ class KernelStamps(WallClock):
         self._bit_ns = _NS / bitrate
 
     def start_ns(self, unix_s: float, size: int, extended: bool) -> int:
-        """Return the start, ns, of a frame of `size` bytes from its kernel stamp `unix_s`.
+        """Return the start of a frame of `size` bytes, ns, from its kernel stamp `unix_s`.
 
-        The start is ``t_end - frame_bits(size, extended) / bitrate``. It is never later than
-        now. A stamp more than 2 s in the past, or more than 1 ms in the future, is replaced by
-        the present time.
+        The start is ``t_end - frame_bits(size, extended) / bitrate``, but at most the current time.
+        A stamp that is more than 2 s in the past, or more than 1 ms in the future, is replaced by
+        the current time.
         """
-        # Use the present time, not the time of the wake-up: otherwise frames that arrive while this
-        # process is delayed would be stamped too early.
+        # The limit is the current time, not the time of the wake-up. Otherwise frames that arrive
+        # while this process is delayed would be stamped too early.
         end = self.monotonic(round(unix_s * _NS), self._monotonic_ns())
         return end - round(frame_bits(size, extended) * self._bit_ns)

@@ -1,9 +1,9 @@
-"""A CAN bus of any kind that python-can supports: SocketCAN on its descriptor, others by a thread.
+"""A CAN bus of any type that python-can supports: SocketCAN, or another type read by a thread.
 
-Frames carry the kernel's stamp where there is one (SocketCAN), otherwise the time of the read.
+Frames get the kernel's stamp if there is one (SocketCAN), otherwise the time of the read.
 
-Invariant: no exception of python-can leaves this module. A fault that may clear by itself raises
-`DeviceLostError`; one that needs another configuration raises `DeviceMisconfiguredError`.
+Invariant: no exception of python-can leaves this module. A fault that may end without a change of
+the settings raises `DeviceLostError`. Any other fault raises `DeviceMisconfiguredError`.
 """
 
 from __future__ import annotations
@@ -39,36 +39,38 @@ if TYPE_CHECKING:
     from jointfit_daemon.driver import CanBusSettings
 
 log = logging.getLogger(__name__)
-# python-can logs each failed opening, once a second for an absent interface; it is raised here.
+# python-can logs each failed opening, which happens once a second for an absent interface. This
+# module raises the error instead.
 logging.getLogger("can.interfaces.socketcan").setLevel(logging.CRITICAL)
-# The same for a bus whose opening failed half-way: `_opening_error` reports the cause.
+# The same applies to a bus whose opening failed halfway: `_opening_error` reports the cause.
 logging.getLogger("can.bus").setLevel(logging.ERROR)
-# socketcand's client logs every byte that it cannot use, and each attempt to connect.
+# The socketcand client logs every byte that it cannot use, and every attempt to connect.
 logging.getLogger("can.interfaces.socketcand").setLevel(logging.CRITICAL)
 
 _BATCH = 64
-"""Frames per wake-up, so that a flood on one bus does not delay the others."""
+"""Largest number of frames per wake-up, so that a flood on one bus does not delay others."""
 _WAITING = 64
-"""Batches by which a reading thread may be ahead of the event loop."""
+"""Largest number of batches by which a reading thread may be ahead of the event loop."""
 _PUMP_S = 0.05
-"""Longest receive call of a reading thread, s: bounds the time to close."""
+"""Longest receive call of a reading thread, s. It limits the time to close the bus."""
 _RECEIVE_BYTES = 1 << 20
-"""Receive buffer, bytes: about 1400 frames. The default of 212 992 bytes holds 278."""
+"""Size of the receive buffer, bytes, for about 1400 frames. The default of 212 992 bytes holds 278
+frames."""
 _DROPS_EVERY_NS = 250_000_000
-"""Period, ns, between two readings of the kernel's drop counter."""
+"""Interval between two readings of the kernel's drop counter, ns."""
 _SO_RCVBUFFORCE, _SO_MEMINFO = 33, 55
 _MEMINFO = struct.Struct("9I")
 _DROPS = 8
-"""Place of the drop counter in SO_MEMINFO."""
+"""Index of the drop counter in SO_MEMINFO."""
 
 
 class PythonCanBus:
-    """One bus, for `can_bus.SharedBus`.
+    """One bus for `can_bus.SharedBus`.
 
     Parameters
     ----------
     settings : CanBusSettings
-        Table ``[can.NAME]`` of rig.toml; unknown keys are passed to python-can unchanged.
+        Table ``[can.NAME]`` of rig.toml. Unknown keys are passed to python-can unchanged.
     """
 
     def __init__(self, settings: CanBusSettings) -> None:
@@ -90,8 +92,8 @@ class PythonCanBus:
         DeviceLostError
             The interface is absent or in use.
         DeviceMisconfiguredError
-            The kind of interface is unknown, a package is missing, or the kernel has no CAN
-            support.
+            The type of interface is unknown, a package is missing, or the kernel does not support
+            CAN.
         """
         bus = await self._open_bus()
         self._bus = bus
@@ -122,7 +124,7 @@ class PythonCanBus:
         loop.add_reader(fd, readable)
 
     def listen(self, ids: Collection[tuple[int, bool]] | None) -> None:
-        """Filter in the kernel (or in python-can, where the backend has no filter)."""
+        """Filter frames in the kernel, or in python-can if the backend has no filter."""
         if self._bus is None:
             return
         filters: list[CanFilter] | None = None
@@ -135,7 +137,7 @@ class PythonCanBus:
                 )
                 for number, extended in ids
             ]
-        # The filter only saves work: frames are also selected here.
+        # The filter only saves time. `SharedBus` selects the frames in any case.
         with suppress(can.CanError, OSError):
             self._bus.set_filters(filters)
 
@@ -154,7 +156,7 @@ class PythonCanBus:
             bus.shutdown()
 
     async def _open_bus(self) -> can.BusABC:
-        """Open the bus, in a thread unless that is fast, and convert its errors."""
+        """Open the bus and convert errors. Slow openings run in a thread."""
         settings = self._settings
         try:
             if self._kernel:
@@ -178,7 +180,7 @@ class PythonCanBus:
         return can.Bus(**keys, ignore_config=True)
 
     def _drain(self, bus: can.BusABC, deliver: Callable[[int, list[CanFrame]], None]) -> None:
-        """Read up to 64 frames and deliver them, also those before an error."""
+        """Read up to 64 frames, and deliver them even if an error follows."""
         frames: list[CanFrame] = []
         self._stamps.pair()
         try:
@@ -200,10 +202,10 @@ class PythonCanBus:
                 deliver(now, frames)
 
     def _convert_frame(self, message: can.Message) -> CanFrame:
-        """Convert the frame just read, stamped by the kernel or with the present time.
+        """Convert a frame that was just read. Its stamp is that of the kernel, or the current time.
 
-        A time from before the read would stamp frames that arrived meanwhile too early, and
-        clocks are fitted to the earliest arrivals.
+        A time from before the read would be too early for frames that arrived in the meantime. This
+        would cause an error, because clocks are fitted to the earliest arrivals.
         """
         data, extended = bytes(message.data[:8]), message.is_extended_id
         t_ns = time.monotonic_ns()
@@ -213,7 +215,7 @@ class PythonCanBus:
         return CanFrame(t_ns, message.arbitration_id, data, *kind)
 
     def _opening_error(self, error: Exception) -> DeviceLostError | DeviceMisconfiguredError:
-        """Return the error for a bus that cannot be opened, with its remedy."""
+        """Return the error for a bus that cannot be opened, including the remedy."""
         channel, kind = self._settings.channel, self._settings.interface
         if isinstance(error, (NotImplementedError, ImportError)):
             faults = bus_faults(self._settings)
@@ -228,7 +230,7 @@ class PythonCanBus:
         )
 
     def _receive_error(self, error: Exception) -> Exception:
-        """Return the error for a bus that stopped; programming errors are returned unchanged."""
+        """Return the error for a bus that stopped. Programming errors are returned unchanged."""
         cause = error.__cause__
         if getattr(error, "error_code", None) is None and isinstance(cause, OSError):
             error = cause  # python-can puts its traceback into some messages
@@ -237,7 +239,7 @@ class PythonCanBus:
         return error
 
     def _error_by_number(self, error: Exception) -> DeviceLostError | DeviceMisconfiguredError:
-        """Choose the error by the kernel's error number."""
+        """Return the error that corresponds to the kernel's error number."""
         channel = self._settings.channel
         number = getattr(error, "error_code", None) or getattr(error, "errno", None)
         if number == errno.EAFNOSUPPORT:
@@ -275,7 +277,8 @@ def _socket(bus: can.BusABC) -> socket.socket:
 def _require_server(bus: can.BusABC) -> None:
     """Raise `DeviceLostError` if a socketcand server has closed the connection.
 
-    python-can then returns no message at once, without an error, and has no public socket.
+    python-can does not report this. It returns no message at once, without an error. It also has no
+    public access to the socket.
     """
     sock: socket.socket | None = getattr(bus, "_SocketCanDaemonBus__socket", None)
     try:
@@ -299,7 +302,7 @@ def _require_interface(name: str) -> None:
 
 
 class _Pump:
-    """A thread that reads a bus without descriptor and delivers batches to the event loop."""
+    """A thread that reads a bus without file descriptor, and delivers batches to the event loop."""
 
     def __init__(
         self,
@@ -310,14 +313,14 @@ class _Pump:
     ) -> None:
         self._bus, self._convert, self._deliver, self._failed = bus, convert, deliver, failed
         self._loop = asyncio.get_running_loop()
-        # While the loop stalls, frames stay in the backend.
+        # While the event loop is delayed, frames stay in the backend.
         self._room = threading.Semaphore(_WAITING)
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="can pump", daemon=True)
         self._thread.start()
 
     async def stop(self) -> None:
-        """End the thread, which takes about 0.1 s at most."""
+        """End the thread, which takes at most about 0.1 s."""
         self._stopped.set()
         await asyncio.to_thread(self._thread.join)
 

@@ -1,7 +1,7 @@
-"""A timer for the silence of one device, which arrivals do not move.
+"""A timer that detects the silence of one device, and that arrivals do not set again.
 
-Invariant: an arrival costs one reading of the clock. The event loop's timer is set again at its end
-only, for the rest of the permitted silence.
+Invariant: an arrival costs one reading of the clock. Only when the event loop's timer ends, it is
+set again for the rest of the permitted silence.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ if TYPE_CHECKING:
 
 
 class SilenceTimer:
-    """Calls `silent` once nothing has arrived for `silence_s`; starts at once.
+    """Calls `silent` when nothing has arrived for `silence_s`. The timer starts at its creation.
 
     Parameters
     ----------
     silence_s : float
-        Permitted time after an arrival, s.
+        Permitted time without data after an arrival, s.
     silent : callable
-        Called at most once, from the event loop.
+        Function that is called at most once, from the event loop.
     first_s : float, optional
-        Permitted time before the first arrival, s; default: `silence_s`.
+        Permitted time before the first arrival, s. The default is `silence_s`.
     """
 
     __slots__ = ("_armed_s", "_due_s", "_now", "_silence_s", "_silent", "_timer")
@@ -38,7 +38,7 @@ class SilenceTimer:
         self._arm()
 
     def note_arrival(self) -> None:
-        """Permit another `silence_s` from now on."""
+        """Permit `silence_s` without data from now on."""
         self._due_s = self._now() + self._silence_s
         if self._due_s < self._armed_s and self._timer is not None:
             self._arm()  # the wait for the first arrival was longer

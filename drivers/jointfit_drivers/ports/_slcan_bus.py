@@ -1,8 +1,8 @@
-"""An SLCAN adapter on a serial port as a CAN bus: handshake, then frames.
+"""A CAN bus through an SLCAN adapter on a serial port: handshake, then reception of frames.
 
-python-can's own SLCAN backend takes hundreds of microseconds a frame. The adapter is opened as a
-normal node (``O``) and not as a silent listener, because a single sensor needs a second node that
-acknowledges its frames. No frame is ever sent on the bus.
+The SLCAN backend of python-can takes hundreds of microseconds per frame, so it is not used. The
+adapter is opened as a normal node (``O``) and not as a silent listener, because a single sensor
+needs a second node that acknowledges its frames. The adapter never sends a frame.
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _QUIET_S = 0.03
-"""Pause, s, after which output of an earlier session has been received completely."""
+"""Pause after which the output of an earlier session has been received completely, s."""
 _OLD_READS = 10
-"""Most reads of old output, for an adapter that never pauses."""
+"""Largest number of reads of old output, for an adapter that never pauses."""
 _ANSWER_S = 0.3
 """Longest wait for an answer, s. Adapters answer within milliseconds, or not at all."""
 _NOT_SLCAN = 8
-"""Number of bytes outside SLCAN lines, without a single valid line, that indicates another kind of
-device."""
+"""Number of bytes outside SLCAN lines that indicates another type of device, if there is no valid
+line."""
 
 
 class SlcanBus:
-    """One adapter, for `can_bus.SharedBus`.
+    """One adapter for `can_bus.SharedBus`.
 
     Parameters
     ----------
     settings : CanBusSettings
-        Table ``[can.NAME]`` of rig.toml; ``channel`` is the serial port.
+        Table ``[can.NAME]`` of rig.toml. The key ``channel`` is the serial port.
     """
 
     def __init__(self, settings: CanBusSettings) -> None:
@@ -58,15 +58,15 @@ class SlcanBus:
     async def open(
         self, deliver: Callable[[int, list[CanFrame]], None], failed: Callable[[Exception], None]
     ) -> None:
-        """Open the port, set the bit rate, open the bus and start reading.
+        """Open the port, set the bit rate, open the bus, and start reading.
 
         Raises
         ------
         DeviceLostError
             The port is absent or in use, or the adapter refuses to open the bus.
         DeviceMisconfiguredError
-            The file is not a serial port, the device does not answer in SLCAN, or it refuses the
-            bit rate.
+            The file is not a serial port, the device does not answer as an SLCAN adapter, or it
+            refuses the bit rate.
         """
         self._port.__enter__()
         try:
@@ -80,7 +80,7 @@ class SlcanBus:
         )
 
     def listen(self, ids: Collection[tuple[int, bool]] | None) -> None:
-        """Accept all frames: the acceptance filter of SLCAN does not support lists."""
+        """Do nothing, so that all frames are accepted: SLCAN filters do not support lists."""
 
     async def close(self) -> None:
         """Stop reading, then close the bus and the port."""
@@ -94,7 +94,7 @@ class SlcanBus:
             with suppress(DeviceLostError, TimeoutError):
                 async with asyncio.timeout(0.1):
                     await self._port.write(b"C\r")
-                    # Closing the port discards unsent bytes.
+                    # Closing the port would discard bytes that are not sent yet.
                     await asyncio.sleep(4 * 10 / self._settings.baud)
         finally:
             self._port.__exit__()
@@ -125,7 +125,7 @@ class SlcanBus:
             failed(error)
 
     async def _handshake(self) -> None:
-        """Open the adapter's bus from any state that an earlier session left."""
+        """Open the adapter's bus, whatever state an earlier session left it in."""
         settings = self._settings
         await self._port.write(b"\r\r\rC\r")  # end an incomplete command, then close the bus
         for _ in range(_OLD_READS):
@@ -160,7 +160,7 @@ class SlcanBus:
             log.debug("%s: the adapter sends no answers; reading anyway", settings.channel)
 
     async def _ask(self, command: bytes, expected: str = "") -> str | None:
-        """Send `command`; return the letter of the answer: `expected`, BELL, or None."""
+        """Send `command`; return the letter of the answer: `expected`, BELL, or None if none."""
         await self._port.write(command)
         loop = asyncio.get_running_loop()
         until = loop.time() + _ANSWER_S
@@ -171,13 +171,13 @@ class SlcanBus:
         return None
 
     async def _receive_answers(self, timeout_s: float) -> list[SlcanLine]:
-        """Return the answers in the next chunk; count valid lines and store early frames."""
+        """Return the answers in the next chunk, count valid lines, and store early frames."""
         chunk = await self._port.receive(timeout_s)
         if chunk is None:
             return []
         found = self._decoder.feed(chunk.data, chunk.t_ns)
         lines = [item for item in found if isinstance(item, SlcanLine)]
-        # A bare CR does not identify an adapter: every device with text replies sends it.
+        # A single CR does not identify an adapter, because every device with text replies sends it.
         frames = [item for item in found if isinstance(item, CanFrame)]
         if frames:  # frames that follow the answer to `O` in the same chunk
             self._early.append((chunk.t_ns, frames))

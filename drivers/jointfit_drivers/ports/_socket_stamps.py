@@ -1,4 +1,4 @@
-"""Arrival times of network data by the stamps of the kernel (SO_TIMESTAMPNS)."""
+"""Arrival times of network data from the kernel's stamps (SO_TIMESTAMPNS)."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ import struct
 from jointfit_drivers.ports._wall_clock import WallClock
 
 _TIMESTAMPNS = getattr(socket, "SO_TIMESTAMPNS", 35)
-"""Socket option of the kernel stamps; the same number on x86-64 and ARM."""
+"""Socket option for kernel stamps. Its number is the same on x86-64 and ARM."""
 _STAMP = struct.Struct("@ll")
 ANCILLARY_BYTES = socket.CMSG_SPACE(_STAMP.size)
-"""Size of the ancillary data of a read."""
+"""Size of the ancillary data of one read, bytes."""
 
 
 class SocketStamps(WallClock):
-    """Converts the stamps of one socket; call `pair` at every wake-up.
+    """Converts the stamps of one socket. Call `pair` at every wake-up.
 
     Parameters
     ----------
     stamped : socket.socket
-        Socket whose data the kernel stamps from now on.
+        Socket whose data the kernel stamps after this object is created.
     """
 
     def __init__(self, stamped: socket.socket) -> None:
@@ -28,7 +28,7 @@ class SocketStamps(WallClock):
         stamped.setsockopt(socket.SOL_SOCKET, _TIMESTAMPNS, 1)
 
     def arrival(self, ancillary: list[tuple[int, int, bytes]], now_ns: int) -> int:
-        """Return the monotonic time, ns, at which data arrived; `now_ns` without a stamp."""
+        """Return the monotonic time at which data arrived, ns; `now_ns` if there is no stamp."""
         for level, kind, value in ancillary:
             if level == socket.SOL_SOCKET and kind == _TIMESTAMPNS and len(value) == _STAMP.size:
                 seconds, ns = _STAMP.unpack(value)

@@ -1,9 +1,9 @@
-"""Conversion of kernel stamps (CLOCK_REALTIME) to CLOCK_MONOTONIC, across wall-clock steps.
+"""Conversion of kernel stamps (CLOCK_REALTIME) to CLOCK_MONOTONIC, including steps of the clock.
 
-Both clocks are slewed alike, so their difference changes only when the wall clock is stepped or
-the host was suspended. A packet that was stamped before a step may be read after it. For
-`OLDEST_NS` after a step both the present difference and the one before the step are therefore
-tried. The one that yields an instant in the recent past is used.
+The kernel slews both clocks equally. Their difference therefore changes only if the wall clock is
+stepped or the host is suspended. A packet that was stamped before a step may be read after it. For
+`OLDEST_NS` after a step, the conversion tries both the current difference and the difference before
+the step. It uses the difference that yields an instant in the recent past.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 STEP_NS = 1_000_000
-"""A larger change of the difference, ns, is a step of the wall clock and not slewing."""
+"""Change of the difference above which it is a step of the wall clock, not slewing, ns."""
 OLDEST_NS = 2_000_000_000
-"""Longest time, ns, that a packet waits in a socket that is being read."""
+"""Longest time that a packet waits in a socket that is being read, ns."""
 _READINGS = 5
-"""Number of readings of both clocks; the reading with the shortest duration is used."""
+"""Number of readings of both clocks. The reading with the shortest duration is used."""
 
 
 class WallClock:
-    """Converts kernel stamps to the monotonic clock; call `pair` at every wake-up.
+    """Converts kernel stamps to the monotonic clock. Call `pair` at every wake-up.
 
     Parameters
     ----------
     monotonic_ns, unix_ns : callable
-        The two clocks, ns; replaced in tests.
+        The two clocks, ns, which tests replace.
     """
 
     def __init__(
@@ -40,10 +40,11 @@ class WallClock:
         self._offset_ns = self._before_ns = self._difference()
         self._stepped_ns = monotonic_ns() - OLDEST_NS
         self.replaced = 0
-        """Stamps replaced by the time of the read, because no difference explained them."""
+        """Number of stamps replaced by the time of the read, because no difference explained
+        them."""
 
     def pair(self) -> int:
-        """Measure the difference of the clocks; return the monotonic time, ns."""
+        """Measure the difference between the clocks; return the monotonic time, ns."""
         offset_ns, now_ns = self._difference(), self._monotonic_ns()
         if abs(offset_ns - self._offset_ns) > STEP_NS:
             self._before_ns, self._stepped_ns = self._offset_ns, now_ns
@@ -51,7 +52,7 @@ class WallClock:
         return now_ns
 
     def monotonic(self, stamp_ns: int, now_ns: int) -> int:
-        """Return the monotonic time, ns, of a wall-clock stamp; at most `now_ns`."""
+        """Return the monotonic time of a wall-clock stamp, ns; at most `now_ns`."""
         found = self._convert(stamp_ns, now_ns)
         if found is None:  # the clock may have been stepped since the last pairing
             self.pair()
@@ -70,7 +71,7 @@ class WallClock:
         return None
 
     def _difference(self) -> int:
-        """Return UNIX time minus monotonic time, ns, from the quickest of five readings."""
+        """Return UNIX time minus monotonic time, ns, from the fastest of five readings."""
         best_width, best = 1 << 62, 0
 
         for _ in range(_READINGS):

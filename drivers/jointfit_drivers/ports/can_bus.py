@@ -1,13 +1,13 @@
-"""CAN buses, each opened once and shared by all devices on it.
+"""CAN buses. Each bus is opened once and shared by all devices on it.
 
-A bus is open while a device uses it. Every device receives chunks with its own frames only. When a
-bus fails, all its devices are lost, each by its own `DeviceLostError`.
+A bus is open while a device uses it. Every device receives chunks that contain only its own frames.
+If a bus fails, all its devices are lost, and each device raises a separate `DeviceLostError`.
 
-A bus is drained from ``loop.add_reader`` on its descriptor, up to 64 frames per wake-up. A backend
-without descriptor is read by one thread that delivers batches. python-can's own Notifier is not
-used because it ignores receive errors.
+The event loop reads a bus through ``loop.add_reader`` on its file descriptor, up to 64 frames per
+wake-up. A backend without file descriptor is read by one thread that delivers batches. python-can's
+Notifier is not used, because it ignores receive errors.
 
-Invariant: drivers use python-can only through this module, which knows no device and no message
+Invariant: drivers use python-can only through this module, which contains no device and no message
 format.
 """
 
@@ -41,24 +41,24 @@ CanKey = tuple[int, bool]
 """Identifier of a frame, and whether it has 29 bits."""
 
 _UNCLAIMED = 512
-"""Stored frames without a subscriber: a third of a second of four sensors at 400 Hz."""
+"""Largest number of stored frames without subscriber, equal to a third of a second of four sensors
+at 400 Hz."""
 _CLAIM_NS = 300_000_000
-"""Age, ns, up to which stored frames are delivered to a new subscriber. The devices of a rig start
-together.
-"""
+"""Largest age of stored frames that are delivered to a new subscriber, ns. The devices of a rig
+start at almost the same time, so their first frames may arrive before they subscribe."""
 _SEEN = 64
-"""Number of unclaimed identifiers whose data are stored for error messages."""
+"""Largest number of unclaimed identifiers whose data are stored for error messages."""
 _NAMED = 8
-"""Number of unclaimed identifiers listed in an error message."""
+"""Largest number of unclaimed identifiers in one error message."""
 _SAMPLES = 4
-"""Stored frames of each unclaimed identifier."""
+"""Number of stored frames for each unclaimed identifier."""
 _EARLY = 16
-"""Chunks that wait for the first frame with the required identifier."""
+"""Largest number of chunks that wait for the first frame with the required identifier."""
 
 
 @dataclass(eq=False, slots=True)
 class _Subscriber:
-    """One device on a bus."""
+    """One device that is subscribed to a bus."""
 
     name: str
     ids: Mapping[CanKey, str]
@@ -67,22 +67,22 @@ class _Subscriber:
     silence_s: float
     needed: CanKey
     others: int
-    """Number of frames of all devices that had arrived before its subscription."""
+    """Number of frames of all devices that had arrived before the subscription."""
     arrived: dict[CanKey, int] = field(default_factory=dict)
-    """Time of the last arrival, ns, of each of its identifiers since its subscription."""
+    """Time of the last arrival of each subscribed identifier since the subscription, ns."""
     timer: SilenceTimer | None = None
-    """Limits the time without the required identifier, while the device is subscribed."""
+    """Timer that limits the time without the required identifier while the device is subscribed."""
     early: deque[Chunk] = field(default_factory=lambda: deque(maxlen=_EARLY))
 
     @property
     def is_complete(self) -> bool:
-        """Whether the required identifier has arrived."""
+        """Whether a frame with the required identifier has arrived."""
         return self.needed in self.arrived
 
     def take(self, t_ns: int, frames: list[CanFrame]) -> None:
-        """Emit `frames`; an exception of `emit` ends this device's pump and no other's.
+        """Emit `frames`. An exception of `emit` ends only the pump of this device.
 
-        Until the required identifier arrives only error frames are emitted; the others wait.
+        Until the required identifier arrives, only error frames are emitted, and other frames wait.
         """
         if self.ended.done():
             return
@@ -106,12 +106,12 @@ class _Subscriber:
 
 
 class SharedBus:
-    """One bus and the devices on it; created by `shared_bus`."""
+    """One bus with its devices. Use `shared_bus` to create it."""
 
     def __init__(self, settings: CanBusSettings) -> None:
         self.channel = settings.channel
         self.foreign = 0
-        """Frames that no device of the rig subscribed to."""
+        """Number of frames to which no device of the rig is subscribed."""
         self._settings = settings
         self._backend: SlcanBus | PythonCanBus | None = None
         self._failed: Exception | None = None
@@ -120,14 +120,15 @@ class SharedBus:
         self._seen: dict[CanKey, deque[bytes]] = {}  # last data of unclaimed identifiers
         self._lock = asyncio.Lock()  # opening and closing take time and must not overlap
         self.users = 0
-        """Devices that use the bus."""
+        """Devices that are subscribed to the bus."""
         self._subscribers: list[_Subscriber] = []
         self._routes: dict[CanKey, _Subscriber] = {}
         self._ids: dict[str, Mapping[CanKey, str]] = {}
-        """Identifiers of every device that has subscribed, also while it waits for a retry."""
+        """Identifiers of every device that has subscribed, including devices that wait for a
+        retry."""
 
     async def enter(self) -> None:
-        """Register a user; the first user opens the bus."""
+        """Register a user of the bus. The first user opens the bus."""
         self.users += 1
         async with self._lock:
             if self._backend is None:
@@ -137,7 +138,7 @@ class SharedBus:
                 self._backend = backend
 
     async def leave(self) -> None:
-        """Unregister a user; the last user closes the bus."""
+        """Unregister a user of the bus. The last user closes the bus."""
         self.users -= 1
         async with self._lock:
             if self.users and self._failed is None:
@@ -159,39 +160,41 @@ class SharedBus:
         worked: bool = False,
         configured_by: str = "with the configuration program of the device",
     ) -> None:
-        """Emit every frame with one of `ids`, in chunks of packed frames, until cancelled.
+        """Emit every frame that has one of `ids`, in chunks of packed frames, until cancelled.
 
-        Error frames are emitted as well, and so are the records with which this host counts dropped
-        frames (`host_dropped`) and corrupt bytes (`host_corrupt`). A count of corrupt bytes goes to
-        one device only, so that the bytes are counted once.
+        Error frames are emitted as well. So are the records with which this host counts dropped
+        frames (`host_dropped`) and corrupt bytes (`host_corrupt`). A record of corrupt bytes is
+        emitted for one device only, so that the bytes are counted once.
 
         Parameters
         ----------
         name : str
-            The device, as named in error messages.
+            Name of the device in error messages.
         ids : mapping
-            Name of the quantity that each identifier carries, for error messages.
+            Identifiers of the device, each with the name of its quantity for error messages.
         emit : callable
-            An exception of `emit` ends the pump and is raised to the caller.
+            Function that receives the chunks. If it raises an exception, the pump ends and raises
+            it.
         silence_s : float
-            Time without a frame with the identifier `needed`, s, after which the device counts
-            as lost.
+            Time without a frame with the identifier `needed` after which the device counts as lost,
+            s.
         needed : CanKey
-            Identifier in `ids` of the frames with measurements.
+            Identifier of the frames with measurements; one of `ids`.
         first_s : float, optional
-            Longest wait for the first of these frames, s; default: `silence_s`.
+            Longest wait for the first of these frames, s. The default is `silence_s`.
         resembles : callable
-            Whether the data of a frame resemble the data of `needed`, for a hint in the error
-            message.
+            Function that returns whether the data of a frame resemble those of `needed`. It is used
+            for a hint in the error message.
         worked : bool
-            Whether the device has sent measurements before: its settings are correct.
+            Whether the device has sent measurements before, which means that its settings are
+            correct.
         configured_by : str
-            How its identifiers and outputs are changed, for error messages.
+            Description of how to change the device's identifiers and outputs, for error messages.
 
         Raises
         ------
         DeviceLostError
-            The bus failed, or no frame with the identifier `needed` arrives while the bus works.
+            The bus failed, or no frame with the identifier `needed` arrived although the bus works.
         DeviceMisconfiguredError
             Another device of the rig uses one of the identifiers.
         """
@@ -204,7 +207,7 @@ class SharedBus:
                     f"({configured_by}) and set `ids` of both"
                 )
 
-        # ends with the error of the bus or of `emit`; with a result: silence
+        # The future ends with the error of the bus or of `emit`, or with a result after silence.
         ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         subscriber = _Subscriber(name, ids, emit, ended, silence_s, needed, self._others)
 
@@ -239,7 +242,7 @@ class SharedBus:
         *,
         worked: bool,
     ) -> str:
-        """Return the missing identifier of a silent device, and those that arrive instead.
+        """Return a text with the missing identifier of a silent device and those received.
 
         The text is the same as long as the findings are the same.
         """
@@ -251,9 +254,9 @@ class SharedBus:
             key for key, t_ns in subscriber.arrived.items() if t_ns > since_ns and key != needed
         )
 
-        # Its settings are correct, because all identifiers arrived before. The text contains no
-        # duration: it would differ at every attempt, and every different text is a new line of
-        # the log.
+        # All identifiers arrived before, so the settings are correct. The text contains no
+        # duration. A duration would differ at every attempt, and every different text becomes a new
+        # line of the log.
         if not others and (subscriber.is_complete or (worked and not self._seen)):
             return f"{self.channel}: silent: check its power and wiring"
 
@@ -284,11 +287,11 @@ class SharedBus:
         self._filter()
 
     def _belongs(self, key: CanKey) -> bool:
-        """Return whether a device of the rig uses the identifier, subscribed or not."""
+        """Return whether a device of the rig uses the identifier, even if not subscribed."""
         return any(key in ids for ids in self._ids.values())
 
     def _filter(self) -> None:
-        """Filter unclaimed frames in the kernel once every device receives its frames."""
+        """Let the kernel filter unclaimed frames when every device receives its frames."""
         if self._backend is not None and self._failed is None:
             complete = all(each.is_complete for each in self._subscribers)
             self._backend.listen(self._routes if complete else None)
@@ -296,7 +299,7 @@ class SharedBus:
     def _claim(self, subscriber: _Subscriber) -> None:
         """Deliver frames that arrived shortly before this device subscribed.
 
-        The first device of a rig opens the bus, and the frames of the others arrive immediately.
+        The first device of a rig opens the bus, and frames of the other devices arrive immediately.
         """
         waiting, self._unclaimed = self._unclaimed, deque(maxlen=_UNCLAIMED)
 
@@ -311,7 +314,7 @@ class SharedBus:
                 self._unclaimed.append((t_ns, frame))
 
     def _deliver(self, t_ns: int, frames: list[CanFrame]) -> None:
-        """Deliver every frame to its subscriber."""
+        """Deliver every frame to the device that subscribed to it."""
         shares: dict[_Subscriber, list[CanFrame]] = {}
         for frame in frames:
             if frame.error:
@@ -325,7 +328,7 @@ class SharedBus:
                 shares.setdefault(subscriber, []).append(frame)
                 continue
 
-            # Stored for later subscribers, and for error messages.
+            # The frame is stored for later subscribers and for error messages.
             self.foreign += 1
             self._unclaimed.append((t_ns, frame))
             if self._belongs(key):
@@ -341,7 +344,7 @@ class SharedBus:
                 self._filter()
 
     def _fail(self, error: Exception) -> None:
-        """End the pump of every device; the first device that ends closes the bus."""
+        """End the pump of every device. The first device that ends closes the bus."""
         self._failed = error
         for each in self._subscribers:
             if not each.ended.done():
@@ -350,7 +353,7 @@ class SharedBus:
 
 
 def _advise_id(needed: CanKey, arriving: CanKey, what: str) -> str:
-    """Return the change of the configuration that accepts the identifier `arriving`."""
+    """Return the change of the configuration with which the identifier `arriving` is accepted."""
     number, extended = arriving
     width = ""
     if extended != needed[1]:
@@ -372,14 +375,15 @@ _BUSES: WeakKeyDictionary[asyncio.AbstractEventLoop, dict[str, SharedBus]] = Wea
 
 @asynccontextmanager
 async def shared_bus(settings: CanBusSettings) -> AsyncIterator[SharedBus]:
-    """Yield the open bus of this ``[can.NAME]`` table, one instance for all its devices.
+    """Yield the open bus of a ``[can.NAME]`` table; all of its devices get the same object.
 
     Raises
     ------
     DeviceLostError
-        The interface is absent, down or in use; it may recover.
+        The interface is absent, down or in use; a retry may succeed.
     DeviceMisconfiguredError
-        This kind of bus is not available here, or the bus cannot run with these settings.
+        This type of bus is not available on this host, or the bus does not work with these
+        settings.
     """
     buses = _BUSES.setdefault(asyncio.get_running_loop(), {})
     key = settings.model_dump_json()

@@ -1,6 +1,6 @@
-"""Network cards of this host with their IPv4 addresses, from the kernel's interface requests.
+"""Network cards of this host and their IPv4 addresses, requested from the kernel.
 
-Only the first address of a card is known to these requests.
+The requests return only the first address of a card.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _SIOCGIFFLAGS, _SIOCGIFADDR, _SIOCGIFBRDADDR, _SIOCGIFNETMASK = 0x8913, 0x8915, 
 _IFF_UP, _IFF_BROADCAST, _IFF_LOOPBACK = 0x1, 0x2, 0x8
 _NAME_BYTES = 15
 _ADDRESS = slice(20, 24)
-"""IPv4 address in ``struct ifreq``, after name, family and port."""
+"""Bytes of the IPv4 address in ``struct ifreq``, after name, family and port."""
 
 
 class NetworkCard(NamedTuple):
@@ -25,11 +25,11 @@ class NetworkCard(NamedTuple):
     address: str
     network: IPv4Network
     broadcast: str | None
-    """Broadcast address of the network; None if it has none, as for loopback."""
+    """Broadcast address of the network; None if there is none, for example for loopback."""
     loopback: bool
 
     def reaches(self, host: str) -> bool:
-        """Return whether `host` is in the network of this card, so that no router is between."""
+        """Return whether `host` is in the network of this card, without a router between them."""
         return IPv4Address(host) in self.network
 
 
@@ -60,7 +60,7 @@ def _read(control: socket.socket, number: int, request: bytes) -> str:
 
 
 def broadcast_networks() -> list[tuple[str, str]]:
-    """Return this host's address and the broadcast address in each network, the loopback first."""
+    """Return this host's address and the broadcast address of each network, loopback first."""
     loopback = "127.0.0.1"
     cards = [(card.address, card.broadcast) for card in network_cards()]
     return [(loopback, loopback), *((local, to) for local, to in cards if to is not None)]

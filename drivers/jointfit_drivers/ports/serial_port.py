@@ -1,9 +1,10 @@
-"""Serial ports: opened and configured by pyserial, read and written by the event loop.
+"""Serial ports, which pyserial opens and configures, and the event loop reads and writes.
 
-A tty has no kernel stamp. Bytes are stamped with the monotonic clock immediately after the read.
+The kernel does not stamp data of a tty. Bytes are stamped with the monotonic clock immediately
+after the read.
 
-Invariant: no exception of pyserial leaves this module. A fault that may clear by itself raises
-`DeviceLostError`; one that needs another configuration raises `DeviceMisconfiguredError`.
+Invariant: no exception of pyserial leaves this module. A fault that may end without a change of the
+settings raises `DeviceLostError`. Any other fault raises `DeviceMisconfiguredError`.
 """
 
 from __future__ import annotations
@@ -30,16 +31,17 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _READ_BYTES = 65536
-"""Bytes per read. A tty buffer holds at most 4095 bytes, so one read empties it."""
+"""Largest number of bytes per read. The buffer of a tty holds at most 4095 bytes, so one read
+empties it."""
 _PORT_ERRORS = (serial.SerialException, termios.error, OSError, ValueError)
-"""Exceptions with which pyserial refuses a port or a speed."""
+"""Exceptions that pyserial raises for a port or a speed that cannot be used."""
 _WRITE_TIMEOUT_S = 2.0
-"""Longest wait for a full port, s. At 9600 baud, 100 bytes take 0.1 s."""
+"""Longest wait while the port accepts no bytes, s. At 9600 baud, 100 bytes take 0.1 s."""
 
 _NOT_A_PORT = frozenset(
     {errno.ENOTTY, errno.EINVAL, errno.EISDIR, errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG}
 )
-"""Error numbers of a file that is not a terminal; all others concern the system or the hardware."""
+"""Error numbers of a file that is not a terminal. All others concern the system or the hardware."""
 
 _LOST: dict[int, str] = {
     errno.ENOENT: "is not there",
@@ -55,15 +57,15 @@ _LOST: dict[int, str] = {
     errno.EPROTO: "returns a USB protocol error",
     errno.ETIMEDOUT: "does not answer the USB host in time",
 }
-"""Texts of common errors. All of them may clear by themselves; EACCES does, because a port that is
+"""Texts of common errors, all of which may end by themselves. EACCES does, because a port that is
 plugged in exists before udev has set its group."""
 
 _ABSENT = frozenset({errno.ENOENT, errno.ENODEV, errno.ENXIO})
-"""Error numbers of a port that is unplugged."""
+"""Error numbers that mean that the port is unplugged."""
 
 
 class SerialPort:
-    """One serial port: 8N1, raw, exclusive, open inside its ``with`` block.
+    """One serial port (8N1, raw, exclusive), which is open inside its ``with`` block.
 
     Parameters
     ----------
@@ -72,12 +74,13 @@ class SerialPort:
     baud : int
         Line speed, bit/s.
     key : str
-        Key of rig.toml that contains `path`, for messages.
+        Key of rig.toml that contains `path`, for error messages.
 
     Raises
     ------
     DeviceLostError
-        On entry: the port is absent, in use, or not permitted (yet). Later: unplugged or silent.
+        On entry: the port is absent, in use, or not (yet) permitted. Later: it is unplugged or
+        silent.
     DeviceMisconfiguredError
         On entry: the file is not a serial port, or the port does not support the speed.
     """
@@ -97,7 +100,7 @@ class SerialPort:
         try:
             self._port.set_low_latency_mode(True)
         except (ValueError, NotImplementedError, AttributeError, OSError) as error:
-            # not supported by ptys and some adapters
+            # Pseudoterminals and some adapters do not support this mode.
             log.debug("%s: no low-latency mode: %s", self.path, error)
         return self
 
@@ -136,7 +139,7 @@ class SerialPort:
         self._baud = baud
 
     def flush_input(self) -> None:
-        """Discard unread bytes of the system's buffer, which may be minutes old."""
+        """Discard unread bytes in the system's buffer, because they may be minutes old."""
         try:
             termios.tcflush(self._fd, termios.TCIFLUSH)
         except termios.error as error:
@@ -148,10 +151,10 @@ class SerialPort:
         Parameters
         ----------
         emit : callable
-            Called from the event loop with each chunk. An exception of `emit` ends the pump and
-            is raised to the caller.
+            Function that is called in the event loop with each chunk. If it raises an exception,
+            the pump ends and raises it.
         silence_s : float, optional
-            Time without a byte, s, after which the device counts as lost; None waits without limit.
+            Time without a byte after which the device counts as lost, s; None waits without limit.
 
         Raises
         ------
@@ -186,10 +189,10 @@ class SerialPort:
                 ended.exception()  # mark as retrieved, in case a cancellation came first
 
     async def receive(self, timeout_s: float) -> Chunk | None:
-        """Return the next chunk, or None if no byte arrives within `timeout_s` seconds.
+        """Return the next chunk; None if no byte arrives within `timeout_s` seconds.
 
-        For handshakes, before `pump`. Bytes that arrive between two calls stay in the system's
-        buffer.
+        Use this method for handshakes, before `pump`. Bytes that arrive between two calls stay in
+        the system's buffer.
 
         Raises
         ------
@@ -216,7 +219,7 @@ class SerialPort:
     def _reader(
         self, take: Callable[[Chunk], None], ended: asyncio.Future[Any]
     ) -> Callable[[], None]:
-        """Return a loop callback that reads and stamps a chunk; its errors go to `ended`."""
+        """Return a loop callback that reads and stamps a chunk; its errors are set in `ended`."""
         loop, fd, path = asyncio.get_running_loop(), self._fd, self.path
         read, now_ns = os.read, time.monotonic_ns
 
@@ -231,8 +234,9 @@ class SerialPort:
                 if not data:  # end of file: the system has closed the port
                     raise _unplugged(path, "hang-up")  # noqa: TRY301 - a call costs a tenth of all
 
-                # Stamp after the read: a stamp from before it would be too early for bytes that
-                # arrive while this process is delayed, and clocks are fitted to the earliest.
+                # The stamp must follow the read. A stamp from before the read would be too early
+                # for bytes that arrive while this process is delayed, and clocks are fitted to the
+                # earliest arrivals.
                 take(Chunk(now_ns(), data))
             except Exception as error:  # noqa: BLE001 - a loop callback's error would only be logged
                 loop.remove_reader(fd)  # a hung-up tty stays readable: 100 % CPU
@@ -242,7 +246,7 @@ class SerialPort:
         return readable
 
     async def write(self, data: bytes) -> None:
-        """Write all of `data`; wait while the port is full.
+        """Write all of `data`, and wait while the port accepts no bytes.
 
         Raises
         ------
@@ -278,7 +282,7 @@ def _unplugged(path: str, found: object) -> DeviceAbsentError:
 def _device_error(
     path: str, baud: int, error: Exception, key: str
 ) -> DeviceLostError | DeviceMisconfiguredError:
-    """Return the error to raise: object, finding, expectation and remedy."""
+    """Return the error to raise, with object, finding, expectation and remedy."""
     number = _error_number(error)
     if number is not None and number not in _NOT_A_PORT:
         found = _LOST.get(number, f"cannot be opened ({os.strerror(number)})")
@@ -296,7 +300,7 @@ def _device_error(
 
 
 def _error_number(error: BaseException | None) -> int | None:
-    """Return the error number of `error`; pyserial leaves that of termios in the context."""
+    """Return the error number of `error`; pyserial hides the number of termios in the context."""
     while error is not None:
         number = getattr(error, "errno", None)
         if isinstance(error, termios.error) and error.args:

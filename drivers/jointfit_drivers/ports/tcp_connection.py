@@ -1,7 +1,7 @@
-"""TCP connections whose data carry their arrival time.
+"""TCP connections that return the arrival time of received data.
 
-The kernel stamps segments on arrival; `SocketStamps` converts the stamps. asyncio's streams do not
-return ancillary data, so this module reads its sockets itself.
+The kernel stamps segments at their arrival, and `SocketStamps` converts the stamps. The streams of
+asyncio do not return these stamps (ancillary data), so this module reads the sockets itself.
 """
 
 from __future__ import annotations
@@ -16,29 +16,30 @@ from typing import NamedTuple
 from jointfit_drivers.ports._socket_stamps import ANCILLARY_BYTES, SocketStamps
 
 READ_BYTES = 1 << 16
-"""Maximum number of bytes of one read."""
+"""Largest number of bytes per read."""
 RECEIVE_BUFFER = 1 << 20
-"""Requested receive buffer, bytes: half a second of large frames while the host is busy."""
+"""Requested size of the receive buffer, bytes. It holds half a second of large frames while the
+host is busy."""
 IDLE_S, PROBE_S, PROBES = 5, 2, 3
-"""A peer without power or cable is detected after 5 s of silence and three unanswered probes, 2 s
-apart."""
+"""Settings for the detection of a peer without power or cable: three unanswered probes, 2 s apart,
+after 5 s of silence."""
 
 
 class ReceivedBytes(NamedTuple):
-    """Bytes of one read."""
+    """Bytes that one read returned."""
 
     t_ns: int
-    """CLOCK_MONOTONIC at which the last of them arrived in the kernel, ns."""
+    """CLOCK_MONOTONIC at which the last of these bytes arrived in the kernel, ns."""
     data: bytes
 
 
 class TcpConnection:
-    """A non-blocking TCP connection whose data carry their arrival time.
+    """A non-blocking TCP connection that returns the arrival time of received data.
 
     Parameters
     ----------
     connected : socket.socket
-        Connected stream socket; closed by `close`.
+        Connected stream socket, which `close` closes.
     """
 
     def __init__(self, connected: socket.socket) -> None:
@@ -60,14 +61,15 @@ class TcpConnection:
         host, port : str, int
             Numeric address and port of the server.
         local : str
-            Address of this host's network card.
+            Address of the network card of this host.
         within_s : float
             Longest wait for the answer, s.
 
         Raises
         ------
         OSError
-            The server refuses or cannot be reached; TimeoutError if it does not answer.
+            The server refuses the connection or cannot be reached. TimeoutError: it does not
+            answer.
         """
         opened = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         try:
@@ -102,12 +104,12 @@ class TcpConnection:
             raise OSError(errno.ENOBUFS, "the server does not read its requests")
 
     def receive(self) -> ReceivedBytes | None:
-        """Return the bytes that have arrived; None if there are none.
+        """Return the bytes that have arrived; None if none have arrived.
 
         Raises
         ------
         OSError
-            The connection is lost; ConnectionResetError also if the server closed it.
+            The connection is lost. ConnectionResetError also means that the server closed it.
         """
         self._stamps.pair()
         try:
@@ -121,12 +123,12 @@ class TcpConnection:
 
 
 class TcpListener:
-    """Waits for one connection from a known host.
+    """Waits for one connection from a given host.
 
     Parameters
     ----------
     local : str
-        Address of this host's network card.
+        Address of the network card of this host.
     """
 
     def __init__(self, local: str) -> None:
@@ -142,11 +144,11 @@ class TcpListener:
 
     @property
     def port(self) -> int:
-        """Port on which it listens."""
+        """TCP port on which this object listens."""
         return int(self._socket.getsockname()[1])
 
     async def accept(self, host: str, within_s: float) -> TcpConnection | None:
-        """Return the connection from `host`; None if there is none within `within_s`."""
+        """Return the connection from `host`; None if `host` does not connect within `within_s`."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(within_s):
                 while True:
@@ -158,5 +160,5 @@ class TcpListener:
         return None
 
     def close(self) -> None:
-        """Stop listening; the accepted connection remains."""
+        """Stop listening. An accepted connection stays open."""
         self._socket.close()

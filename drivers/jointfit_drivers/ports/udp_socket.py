@@ -1,7 +1,8 @@
-"""UDP sockets that stamp every datagram with its arrival.
+"""UDP sockets that return the arrival time of every datagram.
 
-The kernel stamps datagrams on arrival; `SocketStamps` converts the stamps. asyncio's datagram
-endpoint does not return ancillary data, so this module reads its sockets itself.
+The kernel stamps datagrams at their arrival, and `SocketStamps` converts the stamps. The datagram
+endpoint of asyncio does not return these stamps (ancillary data), so this module reads the sockets
+itself.
 """
 
 from __future__ import annotations
@@ -19,21 +20,23 @@ from jointfit_drivers.ports._socket_stamps import ANCILLARY_BYTES, SocketStamps
 MAX_DATAGRAM = 65_507
 """Largest payload of a UDP datagram over IPv4, bytes."""
 DRAIN = 64
-"""Datagrams read at one wake-up; others stay in the queue, so that other sockets are served too."""
+"""Largest number of datagrams read per wake-up. Others stay in the queue, so that other sockets are
+read as well."""
 RECEIVE_BUFFER = 1 << 20
-"""Requested receive buffer, bytes: half a second of large frames while the host is busy."""
+"""Requested size of the receive buffer, bytes. It holds half a second of large frames while the
+host is busy."""
 
 _IP_RECVERR = 11
-"""Socket option: an ICMP refusal becomes an error of this socket, connected or not."""
+"""Socket option with which an ICMP refusal becomes an error of this socket, connected or not."""
 _IP_MULTICAST_ALL = 49
-"""Socket option: 0 restricts reception to groups that this socket joined."""
+"""Socket option. The value 0 restricts reception to the groups that this socket joined."""
 _SIOCGIFADDR = 0x8915
 _ATTACH_FILTER = getattr(socket, "SO_ATTACH_FILTER", 26)
 _INSTRUCTION = struct.Struct("@HBBI")
 _PROGRAM = struct.Struct("@HL")
 _LOAD_WORD, _JUMP_IF_EQUAL, _RETURN = 0x20, 0x15, 0x06  # classic BPF
 _SOURCE_ADDRESS = 0xFFF00000 + 12
-"""Offset of the source address for packet filters: SKF_NET_OFF and its place in the header."""
+"""Offset of the source address in packet filters: SKF_NET_OFF plus the offset in the IP header."""
 _WHOLE_PACKET = 0xFFFFFFFF
 
 
@@ -41,24 +44,24 @@ class Datagram(NamedTuple):
     """One received datagram."""
 
     t_ns: int
-    """CLOCK_MONOTONIC at its arrival in the kernel, ns."""
+    """CLOCK_MONOTONIC at the datagram's arrival in the kernel, ns."""
     data: bytes
     host: str
-    """Source address."""
+    """Source address of the datagram."""
     port: int
-    """Source port."""
+    """Source port of the datagram."""
 
 
 class UdpSocket:
-    """A non-blocking UDP socket whose datagrams carry their arrival time.
+    """A non-blocking UDP socket that returns the arrival time of every datagram.
 
     Parameters
     ----------
     address, port : str, int
-        Local address and port to bind.
+        Local address and port to which the socket is bound.
     sender : str
-        Numeric address. The kernel drops datagrams of other senders, so that a flood of them
-        costs the daemon no time.
+        Numeric address of the sender. The kernel drops datagrams of other senders, so a flood of
+        them costs the daemon no time.
     shared : bool
         Whether other programs of this host may bind the same address and port.
     """
@@ -73,7 +76,7 @@ class UdpSocket:
             if shared:
                 self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
 
-            # The kernel drops datagrams of other senders; the reader checks them again.
+            # The kernel drops datagrams of other senders. The reader checks the sender again.
             (source,) = struct.unpack("!I", socket.inet_aton(sender))
             program = array.array(
                 "B",
@@ -94,9 +97,9 @@ class UdpSocket:
 
     @classmethod
     def in_group(cls, group: str, port: int, local: str, *, sender: str) -> UdpSocket:
-        """Open a socket that receives one multicast group on the network card with address `local`.
+        """Open a socket that receives one multicast group at the network card with address `local`.
 
-        It is bound to the group itself, which excludes other groups on the same port.
+        The socket is bound to the group itself, which excludes other groups on the same port.
         """
         opened = cls(group, port, sender=sender, shared=True)
         try:
@@ -114,7 +117,7 @@ class UdpSocket:
 
     @property
     def port(self) -> int:
-        """Bound local port."""
+        """Local port to which the socket is bound."""
         return int(self._socket.getsockname()[1])
 
     def close(self) -> None:
@@ -122,18 +125,18 @@ class UdpSocket:
         self._socket.close()
 
     def send(self, data: bytes, address: tuple[str, int]) -> None:
-        """Send one datagram; it is dropped if the queue of the network card is full."""
+        """Send one datagram. It is dropped if the queue of the network card is full."""
         with contextlib.suppress(BlockingIOError):
             self._socket.sendto(data, address)
 
     def receive(self) -> list[Datagram]:
-        """Return the available datagrams, at most `DRAIN`.
+        """Return the datagrams that have arrived, at most `DRAIN`.
 
         Raises
         ------
         OSError
-            In particular ConnectionRefusedError: no program listens at the destination of a
-            datagram that was sent.
+            The socket failed. In particular, ConnectionRefusedError means that no program listens
+            at the destination of a datagram that was sent.
         """
         self._stamps.pair()
         found: list[Datagram] = []
@@ -170,12 +173,12 @@ def local_address(server: str, interface: str | None) -> str:
     server : str
         Numeric address of the server.
     interface : str, optional
-        Address or name of the card. None selects the card that routes to the server.
+        Address or name of the card. None selects the card that the kernel uses for the server.
 
     Raises
     ------
     OSError
-        There is no such card, or no route to the server.
+        The card does not exist, or there is no route to the server.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         if interface is None:

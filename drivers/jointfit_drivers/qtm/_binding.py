@@ -1,9 +1,10 @@
-"""Binding of places in the components of frames to the names in rig.toml.
+"""Assignment of positions in the components of frames to the names in rig.toml.
 
-Markers and bodies have no ids: their order is the order in the settings XML. A body whose pose QTM
-gives relative to another body, or to a fixed pose, is refused.
+Markers and bodies have no ids; their order is the order in the XML document of the settings. QTM
+can send the pose of a body relative to another body or to a fixed pose. Such a body is rejected.
 
-Invariant: pure; a binding applies only to frames with the numbers of markers and bodies of its XML.
+Invariant: the module is pure. A binding applies only to frames with the same numbers of markers and
+bodies as its XML.
 """
 
 from __future__ import annotations
@@ -28,25 +29,25 @@ _MEMBER_BITS = 32
 
 @dataclass(frozen=True, slots=True)
 class QtmBinding:
-    """Columns of the frames, until the settings change."""
+    """Columns of the frames. They are valid until the settings change."""
 
     columns: ColumnBinding
     marker_places: list[int]
-    """Place of each marker column in the 3D component."""
+    """Index of each marker column in the 3D component."""
     body_keys: tuple[int, ...]
-    """Place of each body column in the 6D component, or its `segment_key`."""
+    """Index of each body column in the 6D component, or its `segment_key`."""
     labels: int
     """Number of labeled markers."""
     bodies: int
     """Number of 6DOF bodies."""
     enabled: tuple[int, ...]
-    """Places of the enabled bodies."""
+    """Indices of the enabled bodies."""
     skeletons: int
 
     def body_places(self, count: int) -> tuple[int, ...] | None:
-        """Return the number of the body at each place of a component of `count` bodies.
+        """Return the number of the body at each index of a component with `count` bodies.
 
-        None if the component does not fit the settings.
+        Return None if the component does not fit the settings.
         """
         if count == self.bodies:
             return tuple(range(count))
@@ -56,14 +57,14 @@ class QtmBinding:
 def bind_settings(
     settings: QtmSettingsXml, markers: Mapping[str, str], bodies: Mapping[str, str]
 ) -> QtmBinding:
-    """Return the columns for the settings of a server.
+    """Return the columns that correspond to the settings of a server.
 
     Parameters
     ----------
     settings : QtmSettingsXml
-        The server's latest settings.
+        Most recent settings of the server.
     markers, bodies : mapping of str to str
-        Names in rig.toml, and the key of each.
+        Names in rig.toml, each with its key.
     """
     of_markers = [
         ModelEntry(place, "", name, place + 1)
@@ -103,5 +104,8 @@ def bind_settings(
 
 
 def segment_key(skeleton: int, segment: int) -> int:
-    """Return the key of a segment: negative, so that it is no place of a body."""
+    """Return the key of a skeleton segment.
+
+    It is negative, so that it differs from body indices.
+    """
     return -1 - (skeleton << _MEMBER_BITS | segment)

@@ -1,10 +1,10 @@
-"""Order of the frames of one QTM server, by their time stamps.
+"""Order of the frames of one server of Qualisys Track Manager (QTM), by their time stamps.
 
-Frame numbers are not trusted: they can stay at 1 in live preview, and the real-time rate can be a
-part of the camera rate. Losses are counted in units of the usual step of the number.
+Frame numbers are not reliable. They can stay at 1 in live preview, and the real-time rate can be a
+fraction of the camera rate. Losses are counted in units of the usual step of the number.
 
-Invariant: pure. A stamp that decreases by more than reordering explains is a restart: each
-measurement, and each loop of a recording, begins at 0.
+Invariant: the module is pure. A stamp that decreases by more than reordering can explain is a
+restart, because the time of each measurement and of each loop of a recording begins at 0.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from jointfit_drivers.motion_capture import FrameStep
 _REORDERED_US = 200_000
 """Largest decrease of the stamp in a reordered datagram, µs."""
 _LATE_RUN = 10
-"""Consecutive late frames that are no reordering but a short loop of a recording."""
+"""Number of consecutive late frames that are no reordering, but a short loop of a recording."""
 _STEPS = 20
-"""Last steps of the frame number, the smallest of which is the usual one."""
+"""Number of recent steps of the frame number. The smallest of them is the usual step."""
 _MOST_LOST = 100_000
-"""Largest plausible loss, frames: more is due to a number that jumped."""
+"""Largest plausible loss, frames. A larger loss is a jump of the number."""
 
 _NEXT, _DROP, _RESTART = FrameStep(), FrameStep(use=False), FrameStep(restarted=True)
 
@@ -32,28 +32,29 @@ class TimestampContinuity:
         self._stamp_us: int | None = None
         self._number = 0
         self.number = 0
-        """Number of the last accepted frame, which advances even if the number of QTM does not."""
+        """Number of the last accepted frame. It increases even if the number that QTM sends does
+        not."""
         self._late_run = 0
         self._steps: deque[int] = deque(maxlen=_STEPS)
         self._intervals_us: deque[int] = deque(maxlen=_STEPS)
         self.duplicates = 0
-        """Number of frames dropped because they had the stamp of the preceding frame."""
+        """Number of frames dropped because they had the stamp of the previous frame."""
         self.late = 0
-        """Frames dropped because a later one had arrived."""
+        """Number of frames dropped because a later frame had already arrived."""
 
     @property
     def began(self) -> bool:
-        """Whether there was a frame since the start."""
+        """Whether a frame has arrived since the start."""
         return self._stamp_us is not None
 
     def forget(self) -> None:
-        """Start again with the next frame."""
+        """Discard the state, so that the next frame is treated as the first."""
         self._stamp_us = None
         self._steps.clear()
         self._intervals_us.clear()
 
     def frame(self, stamp_us: int, number: int) -> FrameStep:
-        """Return the step for one frame, from its stamp, µs, and its number."""
+        """Return the classification of one frame by its stamp, µs, and its number."""
         before, step = self._stamp_us, _NEXT
         advanced = number - self._number
         if before is None:

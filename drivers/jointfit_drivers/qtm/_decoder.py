@@ -1,9 +1,9 @@
-"""Decoder of the QTM driver: packets in, optical frames out.
+"""Decoder of servers of Qualisys Track Manager (QTM): converts packets to optical frames.
 
-Every chunk is one packet, from the connection or from a datagram. A frame that arrives before the
-settings, or that does not fit them, is counted in `unpublished` and dropped.
+Every chunk is one packet, received by TCP or as a datagram. A frame that arrives before the
+settings, or that does not fit them, is dropped and counted in `unpublished`.
 
-Invariant: the output depends only on the chunks fed; the decoder reads no clock and no socket.
+Invariant: the output depends only on the chunks fed. The decoder reads no clock and no socket.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
     from jointfit_drivers.qtm._settings import QtmSettings
 
 CAMERA_CLOCK = TickClock(100, None)
-"""Camera time: units of 100 ns."""
+"""Clock of the cameras, in units of 100 ns."""
 MEASUREMENT_CLOCK = TickClock(1000, None)
-"""Time since the measurement began, µs."""
+"""Clock that starts at the beginning of a measurement, in µs."""
 _MOST_NS = 2**63
 _UP_AXES = {"+X": "x", "-X": "-x", "+Y": "y", "-Y": "-y", "+Z": "z", "-Z": "-z"}
 _MISSING_TEXTS = {
@@ -51,7 +51,7 @@ class QtmDecoder:
     Parameters
     ----------
     settings : QtmSettings
-        Names in rig.toml, and up axis.
+        The ``[mocap]`` table with names and up axis.
     """
 
     def __init__(self, settings: QtmSettings) -> None:
@@ -74,29 +74,29 @@ class QtmDecoder:
         self.messages = 0
         """Number of well-formed packets of any kind so far."""
         self.discarded_bytes = 0
-        """Number of bytes in packets that contained no message."""
+        """Number of bytes in packets that contain no message."""
         self.unpublished = 0
-        """Frames that arrived before the settings, or that did not fit them."""
+        """Number of frames that arrived before the settings, or that did not fit them."""
         self.suspicious = 0
-        """Poses and stamps rejected because their numbers are implausible."""
+        """Number of poses and stamps rejected because of implausible numbers."""
 
     @property
     def tick_clock(self) -> TickClock | None:
-        """Camera time if QTM streams it, otherwise the time since the measurement began."""
+        """Camera time if QTM streams it; otherwise time since the beginning of the measurement."""
         return self._clock
 
     @property
     def duplicates(self) -> int:
-        """Number of frames dropped because they had the stamp of the preceding frame."""
+        """Number of frames dropped because they had the stamp of the previous frame."""
         return self._continuity.duplicates
 
     @property
     def late(self) -> int:
-        """Frames dropped because a later one had arrived."""
+        """Number of frames dropped because a later frame had already arrived."""
         return self._continuity.late
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return the content of one packet; never raises."""
+        """Return the content of one packet; never raise."""
         message = qtm.decode(chunk.data)
         if isinstance(message, CorruptBytes):
             self.discarded_bytes += message.discarded
@@ -129,13 +129,13 @@ class QtmDecoder:
         return out
 
     def flush(self) -> list[Decoded]:
-        """Return an empty list: every chunk is a whole packet."""
+        """Return an empty list, because every chunk is a complete packet."""
         return []
 
     # --- settings and events ------------------------------------------------------------------
 
     def _take_settings(self, xml: str, out: list[Decoded]) -> None:
-        """Bind the columns to the settings; append their changes and the warnings about them."""
+        """Assign the columns to the settings; append changes and warnings."""
         settings = qtm.parse_settings(xml)
         if settings is None:
             out.append(DeviceEvent("warning", "the settings of QTM are not readable XML"))
@@ -170,7 +170,7 @@ class QtmDecoder:
         out += self._warnings(settings, axis)
 
     def _warnings(self, settings: qtm.QtmSettingsXml, axis: str | None) -> list[DeviceEvent]:
-        """Return the findings about settings that cost accuracy or data."""
+        """Return warnings about settings that reduce accuracy or lose data."""
         texts = []
         if not self._camera_time:
             texts.append(
@@ -189,7 +189,7 @@ class QtmDecoder:
         return [DeviceEvent("warning", text) for text in texts]
 
     def _event(self, number: int, out: list[Decoded]) -> None:
-        """Append the effects of an event of the server."""
+        """Append the effects of an event that the server sent."""
         if number in (QtmEvent.RT_FROM_FILE_STARTED, QtmEvent.RT_FROM_FILE_STOPPED):
             live = number == QtmEvent.RT_FROM_FILE_STOPPED
             if live != self._live:
@@ -233,7 +233,7 @@ class QtmDecoder:
         self._waiting = False
         self.suspicious += found.suspicious
 
-        # Warn of each announced component that does not arrive.
+        # Warn about each announced component that does not arrive.
         absent = self._parts.absent
         if absent != self._reported:
             new = [kind for kind in absent if kind not in self._reported]
@@ -257,7 +257,7 @@ class QtmDecoder:
         )
 
     def _ticks(self, frame: CompleteFrame, out: list[Decoded]) -> int | None:
-        """Return the exposure in ticks of the clock in use; the clocks are not mixed."""
+        """Return the exposure in ticks of the clock in use; the two clocks are never mixed."""
         component = frame.components.get(ComponentType.TIMECODE)
         codes = component.timecodes if isinstance(component, qtm.TimecodeComponent) else ()
         camera = next((t for code in codes if (t := code.camera_ticks) is not None), None)

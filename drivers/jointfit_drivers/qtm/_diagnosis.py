@@ -2,11 +2,11 @@
 
 | cause | evidence |
 |---|---|
-| QTM is not running, wrong port | the connection is refused, or the answer is not that of QTM |
+| QTM is not running, wrong port | the connection is refused, or the answer is not from QTM |
 | no measurement | QTM answers "no more data", or has no parameters |
-| firewall | frames arrive by TCP, and none by UDP |
-| 6DOF or labels not calculated | frames lack the component, and the settings show it |
-| names | the settings lack names of rig.toml |
+| firewall | frames arrive by TCP, but not by UDP |
+| 6DOF or labels not calculated | frames lack the component, and the settings show the reason |
+| names | the settings do not contain names of rig.toml |
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ async def diagnose(settings: QtmSettings, wait_s: float) -> list[Finding]:
         remedy = f"set server and command_port in [mocap]; ping {name}"
         return [Finding(CHECK, name, "error", text, remedy)]
 
-    # QTM answers and sends nothing: a firewall may drop the datagrams.
+    # QTM answers but sends no frames. A firewall may drop the datagrams.
     if settings.transport == "udp":
         over_tcp = await _receive(patient.model_copy(update={"transport": "tcp"}), wait_s)
         if over_tcp.frames:
@@ -59,7 +59,7 @@ async def diagnose(settings: QtmSettings, wait_s: float) -> list[Finding]:
 
 
 async def _receive(settings: QtmSettings, wait_s: float) -> Reception:
-    """Receive as the driver does."""
+    """Receive frames in the same way as the driver."""
 
     async def connect(emit: Emit) -> None:
         route = await find_route("QTM", settings)

@@ -1,7 +1,7 @@
 """Driver of Qualisys Track Manager by its real-time protocol, over TCP and UDP.
 
-`QtmDecoder` is the pure part. `QtmMocap.run` connects and emits every packet of the server, answers
-included, so that a replay has the same input as the live decoder.
+`QtmDecoder` is the pure part. `QtmMocap.run` connects and emits every packet of the server. This
+includes the answers, so a replay has the same input as the live decoder.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ class QtmMocap:
 
     Settings: ClassVar[type[QtmSettings]] = QtmSettings
     wire: ClassVar[Wire] = "datagram"
-    """A chunk is one packet of the protocol, over TCP as over UDP."""
+    """A chunk is one packet of the protocol, both over TCP and over UDP."""
 
     packet_stream = QtmStream
-    """Splits the bytes of a recorded connection into packets."""
+    """Class that splits the bytes of a recorded connection into packets."""
 
     find_servers = staticmethod(find_servers)
     diagnose = staticmethod(diagnose)
@@ -47,11 +47,11 @@ class QtmMocap:
         Raises
         ------
         DeviceLostError
-            The host is unknown, does not answer, has no listening server, has too many clients, or
-            sends no frame for ``silence_s`` during a measurement. A retry may succeed.
+            The host is unknown, does not answer, has no listening server, or has too many clients.
+            Or it sends no frame for ``silence_s`` during a measurement. A retry may succeed.
         DeviceMisconfiguredError
-            The host is no QTM server, its port is big-endian, its version is not supported, or the
-            network card is unknown.
+            The host is not a QTM server, its port is big-endian, its version is not supported, or
+            the network card does not exist.
         """
         route = await find_route("QTM", self._settings)
         await QtmSession(self._settings, route, emit, self._output).run()

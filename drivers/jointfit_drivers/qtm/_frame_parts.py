@@ -1,7 +1,8 @@
-"""Parts of one frame: over UDP a frame may arrive as several packets with the same number.
+"""Parts of one frame: over UDP, a frame may arrive as several packets with the same number.
 
-Invariant: pure. A frame is complete with every component that the settings announce, or when a
-packet of another frame arrives. A component that never arrives is not waited for.
+Invariant: the module is pure. A frame is complete when it has every component that the settings
+announce, or when a packet of another frame arrives. If a component does not arrive repeatedly,
+frames no longer wait for it.
 """
 
 from __future__ import annotations
@@ -14,25 +15,25 @@ if TYPE_CHECKING:
     from jointfit_protocols.qtm import Component, DataFrame
 
 _PATIENCE = 10
-"""Consecutive frames without a component after which it is not expected any more."""
+"""Number of consecutive frames without a component after which it is no longer expected."""
 
 
 class CompleteFrame(NamedTuple):
-    """One frame with all of its components."""
+    """One frame with all of its received components."""
 
     arrival_ns: int
-    """Arrival of its first packet."""
+    """Arrival of the frame's first packet, ns."""
     timestamp_us: int
     number: int
     components: dict[int, Component]
 
 
 class FrameParts:
-    """Merges the packets of frames."""
+    """Merges the packets of each frame."""
 
     def __init__(self) -> None:
         self._expected: dict[int, int] = {}
-        """Announced components, and the number of last frames without each."""
+        """Announced components, each with the number of consecutive frames without it."""
         self._pending: CompleteFrame | None = None
 
     @property
@@ -41,12 +42,12 @@ class FrameParts:
         return tuple(kind for kind, missed in self._expected.items() if missed >= _PATIENCE)
 
     def expect(self, kinds: Iterable[int]) -> None:
-        """Set the components of each frame; incomplete frames are dropped."""
+        """Set the components that each frame must have, and drop incomplete frames."""
         self._expected = dict.fromkeys(kinds, 0)
         self._pending = None
 
     def add(self, arrival_ns: int, packet: DataFrame) -> list[CompleteFrame]:
-        """Return the frames that a packet completes, in order."""
+        """Return the frames that a packet completes, in the order of arrival."""
         done = []
         pending, identity = self._pending, (packet.timestamp_us, packet.number)
         if pending is not None and (pending.timestamp_us, pending.number) != identity:

@@ -1,7 +1,8 @@
 """Conversion of the components of one QTM frame to columns: SI units, world z up, NaN if missing.
 
-Positions are millimetres, rotation matrices column-major. All bits of the numbers of a missing
-marker or body are set; every position that is not finite counts as missing.
+The server sends positions in millimetres and rotation matrices in column-major order. For a missing
+marker or body, all bits of its numbers are set. Every position that is not finite counts as
+missing.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class QtmColumns(NamedTuple):
     residuals: Array
     """Residual of each marker, m; NaN if missing or zero."""
     suspicious: int
-    """Bodies that have a position, but no valid rotation."""
+    """Number of bodies that have a position but no valid rotation."""
 
 
 class QtmPoseConverter:
@@ -52,7 +53,7 @@ class QtmPoseConverter:
     Parameters
     ----------
     up_axis : UpAxis
-        The stream's axis that points up.
+        Axis of the stream that points up.
     """
 
     def __init__(self, up_axis: str) -> None:
