@@ -1,4 +1,4 @@
-"""Count of the messages of one device that became no sample."""
+"""Counter of the messages of one device that yielded no sample."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ if TYPE_CHECKING:
 
 
 class Refusals:
-    """Counts messages that became no sample."""
+    """Counts messages that yielded no sample."""
 
     def __init__(self) -> None:
         self.refused = self.refused_bytes = 0
-        """Messages that became no sample, and their bytes."""
+        """Number of messages that yielded no sample, and the number of their bytes."""
 
     def refuse(self, size: int, reason: str) -> Corrupt:
-        """Count a message of `size` bytes that becomes no sample."""
+        """Count a message of `size` bytes that yields no sample."""
         self.refused += 1
         self.refused_bytes += size
         return Corrupt(size, reason, rejected=1)
 
     def flush(self) -> list[Decoded]:
-        """Refuse a sample that waits for confirmation; without such checks there is none."""
+        """Reject a sample that waits for confirmation; this class has none, but subclasses may."""
         return []

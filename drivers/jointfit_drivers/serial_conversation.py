@@ -1,7 +1,7 @@
-"""Requests to a device on a serial line and its replies, while its bytes are passed on.
+"""Exchange of requests and replies with a device on a serial line.
 
-Bytes before the first reply are old or foreign and are discarded. From this reply on, every byte is
-emitted once, so that the decoder also receives the device's replies.
+Bytes before the first reply are old or come from another device, and are discarded. From the first
+reply on, every byte is emitted once, so that the decoder also receives the device's replies.
 """
 
 from __future__ import annotations
@@ -22,23 +22,24 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _QUIET_S = 0.1
-"""Pause, s, after which the rest of a message with a corrupt length is no longer expected."""
+"""Pause after which the rest of a message with a corrupt length is no longer expected, s."""
 _KEPT = 8192
-"""Number of bytes stored before the first reply: more than one message and the following data."""
+"""Number of bytes stored before the first reply. It exceeds one message and the data that
+follow."""
 _LOGGED = 20
-"""Chunks that are logged at the debug level, so that a new device can be judged from a log."""
+"""Number of chunks logged at debug level, so that the log contains raw data of a new device."""
 
 
 class WireMessage(Protocol):
-    """Message of a codec."""
+    """Interface of the messages that a codec returns."""
 
     @property
     def size(self) -> int:
-        """Length on the wire, bytes."""
+        """Length of the message on the wire, bytes."""
 
     @property
     def end(self) -> int:
-        """Number of bytes fed to the codec up to and including the last byte of the message."""
+        """Number of bytes fed to the codec until the end of the message."""
 
 
 Message = TypeVar("Message", bound=WireMessage)
@@ -46,7 +47,7 @@ Found_co = TypeVar("Found_co", bound=WireMessage, covariant=True)
 
 
 class StreamCodec(Protocol[Found_co]):
-    """Codec of a byte stream."""
+    """Interface of a codec for a byte stream."""
 
     fed: int
 
@@ -55,23 +56,23 @@ class StreamCodec(Protocol[Found_co]):
         """Number of bytes of the incomplete message in the buffer."""
 
     def feed(self, data: bytes) -> Sequence[Found_co | CorruptBytes]:
-        """Return the messages that `data` completed."""
+        """Return the messages that `data` completes."""
 
     def flush(self) -> Sequence[Found_co | CorruptBytes]:
-        """Return messages hidden in the pending bytes."""
+        """Return messages that the pending bytes of an incomplete message contain."""
 
 
 class SerialConversation(Generic[Message]):
-    """Requests and replies of one device on one port.
+    """Exchange of requests and replies with one device on one port.
 
     Parameters
     ----------
     port : SerialPort
         Open port.
     emit : Emit
-        Receives all bytes from the first reply on.
+        Function that receives all bytes from the first reply on.
     make_codec : callable
-        Returns a new codec.
+        Function that returns a new codec.
     """
 
     def __init__(
@@ -86,10 +87,10 @@ class SerialConversation(Generic[Message]):
         self.received = 0
         """Number of bytes received so far."""
         self.understood = 0
-        """Messages received so far."""
+        """Number of messages received so far."""
 
     def reset(self) -> None:
-        """Discard received bytes, here and in the port: for another speed or a new start."""
+        """Discard received bytes, here and in the port, for another speed or a new start."""
         self._port.flush_input()
         self._codec, self._recent = self._make_codec(), b""
         self.received = self.understood = 0
@@ -101,7 +102,7 @@ class SerialConversation(Generic[Message]):
     async def ask(
         self, request: bytes, is_reply: Callable[[Message], bool], *, tries: int, wait_s: float
     ) -> Message | None:
-        """Send a request until its reply arrives; return None if it does not."""
+        """Send a request until its reply arrives; return None if no reply arrives."""
         for _ in range(tries):
             await self.send(request)
             reply = await self.receive(is_reply, wait_s)
@@ -110,7 +111,7 @@ class SerialConversation(Generic[Message]):
         return None
 
     async def receive(self, is_reply: Callable[[Message], bool], wait_s: float) -> Message | None:
-        """Return the first message that `is_reply` accepts, or None after `wait_s` seconds."""
+        """Return the first message that `is_reply` accepts; None after `wait_s` seconds."""
         loop = asyncio.get_running_loop()
         until = loop.time() + wait_s
         while (left := until - loop.time()) > 0:

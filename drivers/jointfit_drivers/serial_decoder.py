@@ -1,6 +1,6 @@
-"""Bases of decoders of IMUs on a serial line: all but the conversion of one message.
+"""Base classes of decoders for IMUs on a serial line; subclasses convert single messages.
 
-Invariant: the output depends only on the chunks fed; no clock and no port is read.
+Invariant: the output depends only on the chunks fed. The decoder reads no clock and no port.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class CountingCodec(StreamCodec[Found_co], Protocol[Found_co]):
-    """Codec of a byte stream that counts, such as a `ResynchronizingCodec`."""
+    """Codec that counts discarded bytes, such as a `ResynchronizingCodec`."""
 
     messages: int
 
@@ -34,21 +34,21 @@ class CountingCodec(StreamCodec[Found_co], Protocol[Found_co]):
 
 
 class SerialMessageDecoder(ABC, Generic[Message]):
-    """Decoder of one device; a subclass converts one message, and stamps it if it needs a stamp.
+    """Decoder of one device. A subclass converts each message and computes its stamp if necessary.
 
-    After a silence, the rest of an incomplete message is not awaited.
+    After a silence, the decoder discards an incomplete message.
 
     Parameters
     ----------
     codec : CountingCodec
-        New codec. Its messages have `size`, bytes on the wire, and `end`, bytes fed up to and
-        including the last one.
+        New codec. Its messages have the attributes `size`, bytes on the wire, and `end`, bytes fed
+        to the codec until the end of the message.
     refusals : Refusals
-        Count of its messages that became no sample.
+        Counter of the messages that yielded no sample.
     baud : int, optional
-        Line speed, bit/s, for back-dating of stamps; None for USB, whose bytes take no time.
+        Line speed, bit/s, for back-dating of stamps; None for USB, whose bytes have no duration.
     longest : int
-        Size of the largest message.
+        Size of the largest message, bytes.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class SerialMessageDecoder(ABC, Generic[Message]):
         """Return the samples and events of one message."""
 
     def _take_corrupt(self, found: CorruptBytes) -> list[Decoded]:
-        """Return the corrupt bytes; a subclass adds what they show."""
+        """Return an event for corrupt bytes; a subclass may add findings."""
         return [Corrupt(found.discarded, found.reason)]
 
     @property
@@ -81,7 +81,7 @@ class SerialMessageDecoder(ABC, Generic[Message]):
         return self._codec.discarded + self._refusals.refused_bytes
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return the content that `chunk` completed, in wire order; never raises."""
+        """Return the samples and events that `chunk` completes, in wire order; never raise."""
         out: list[Decoded] = []
         if self._codec.pending and self._stamps.is_silent_before(chunk.t_ns, len(chunk.data)):
             self._append(self._codec.flush(), out)  # the rest of the message was lost
@@ -95,7 +95,7 @@ class SerialMessageDecoder(ABC, Generic[Message]):
         return out
 
     def flush(self) -> list[Decoded]:
-        """Discard an incomplete message and a sample that waits for confirmation."""
+        """Discard an incomplete message, and a sample that waits for confirmation."""
         out: list[Decoded] = []
         self._append(self._codec.flush(), out)
         return out + self._refusals.flush()
@@ -113,17 +113,17 @@ class SerialMessageDecoder(ABC, Generic[Message]):
 
 
 class SerialDecoder(SerialMessageDecoder[Message]):
-    """Decoder of one device whose samples pass `CheckedSamples`; a subclass converts one message.
+    """Decoder of one device whose samples pass `CheckedSamples`; a subclass converts messages.
 
-    A sample is stamped with the arrival of its first byte. After a silence, the rest of an
-    incomplete message is not awaited.
+    The stamp of a sample is the arrival of its first byte. After a silence, the decoder discards an
+    incomplete message.
 
     Parameters
     ----------
     codec, baud, longest
-        As those of `SerialMessageDecoder`.
+        As described at `SerialMessageDecoder`.
     samples : CheckedSamples
-        New checks; `convert` adds its samples to them.
+        Checks for samples. `convert` adds its samples to them.
     """
 
     def __init__(
@@ -145,12 +145,12 @@ class SerialDecoder(SerialMessageDecoder[Message]):
         message
             Message of the codec.
         arrival_ns
-            Arrival of its first byte, monotonic ns.
+            Arrival of the first byte of the message, monotonic ns.
         """
 
     @property
     def tick_clock(self) -> TickClock | None:
-        """Unit and modulus of the device time; None without one."""
+        """Unit and modulus of the device time; None if the device sends no time."""
         return self.samples.tick_clock
 
     @override

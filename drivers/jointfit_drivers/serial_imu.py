@@ -1,6 +1,6 @@
-"""Parts that drivers of IMUs on a serial line share.
+"""Common parts of drivers for IMUs on a serial line.
 
-These are the keys of the connection, the stamps of messages, and errors of the configuration.
+The module contains the keys of the connection, the stamps of messages, and configuration errors.
 """
 
 from __future__ import annotations
@@ -19,21 +19,20 @@ from jointfit_daemon.driver import (
 )
 
 _BITS = 10
-"""Bits of one byte on the line, 8N1."""
+"""Number of bits of one byte on the line (8N1)."""
 _SILENCE_FLOOR_NS = 250_000_000
-"""Lower bound, ns, of the silence after which a pending message is discarded.
+"""Smallest silence after which an incomplete message is discarded, ns.
 
-At high speed the duration of 1.5 messages is so short that a host that reads late would look like a
-silent line.
+At high speed, the duration of 1.5 messages is so short that a delayed read by the host would look
+like silence.
 """
 _PERIODS_OF_SILENCE = 3
 """Smallest number of sample periods without data after which a device counts as silent. A slow
-device may be silent for two periods.
-"""
+device may send nothing for two periods."""
 _RATE_TOLERANCE = 1e-3
 """Largest relative difference between a requested rate and the rate of a device."""
 _RATES_SHOWN = 12
-"""Rates that a message lists."""
+"""Largest number of rates in one message."""
 
 
 class SerialImuSettings(ImuSettings):
@@ -51,7 +50,7 @@ class SerialImuSettings(ImuSettings):
 
     @property
     def line_baud(self) -> int | None:
-        """Speed that delays bytes, baud; None for USB."""
+        """Line speed that determines the duration of bytes, baud; None for USB."""
         return self.baud if self.transport == "uart" else None
 
     @property
@@ -62,7 +61,7 @@ class SerialImuSettings(ImuSettings):
     def require_line_speed(self, speed: str = "the speed of the device") -> None:
         """Raise DeviceMisconfiguredError if the data need more bits per second than `baud`.
 
-        `speed` is the setting of the device that corresponds to `baud`.
+        `speed` is the name of the device setting that corresponds to `baud`.
         """
         needs = self.serial_bits_per_s
         if needs is not None and needs > self.baud:
@@ -72,12 +71,12 @@ class SerialImuSettings(ImuSettings):
             )
 
     def rate_divisor(self, base_hz: int, model: str) -> int:
-        """Return the divisor of the rate of a device that gives `rate_hz`.
+        """Return the divisor with which the device sends at `rate_hz`.
 
         Raises
         ------
         DeviceMisconfiguredError
-            `rate_hz` is no whole fraction of `base_hz`.
+            `rate_hz` is not an integer fraction of `base_hz`.
         """
         divisor = round(base_hz / self.rate_hz)
         if divisor < 1 or abs(base_hz / divisor - self.rate_hz) > _RATE_TOLERANCE * self.rate_hz:
@@ -104,38 +103,39 @@ class SerialImuSettings(ImuSettings):
 
 
 class ArrivalStamps:
-    """Arrival of the first byte of each message on a serial line.
+    """Computes the arrival of the first byte of each message on a serial line.
 
-    A message is stamped with the arrival of its chunk minus the duration of the message and of the
-    bytes behind it, at ten bits per byte.
+    The stamp is the arrival of the chunk minus the duration of the message and of all later bytes
+    in the chunk, at ten bits per byte.
 
     Parameters
     ----------
     baud : int, optional
-        Line speed, bit/s; None for USB, whose bytes take no time.
+        Line speed, bit/s; None for USB, whose bytes have no duration.
     most_bytes : int
-        Size of the largest message.
+        Size of the largest message, bytes.
     """
 
     def __init__(self, baud: int | None, most_bytes: int) -> None:
         self._byte_ns = 0.0 if baud is None else _BITS * 1e9 / baud
         self._silence_ns = max(1.5 * most_bytes * self._byte_ns, _SILENCE_FLOOR_NS)
         self.chunk_ns = 0
-        """Arrival of the present chunk, monotonic ns."""
+        """Arrival of the current chunk, monotonic ns."""
         self._stamp_ns = 0
 
     def is_silent_before(self, t_ns: int, size: int) -> bool:
-        """Return whether the line was silent before a chunk: the rest of a message was lost."""
+        """Return whether no bytes arrived for so long that the rest of a message was lost."""
         return t_ns - self.chunk_ns - size * self._byte_ns > self._silence_ns
 
     def start_chunk(self, t_ns: int) -> None:
-        """Stamp messages by a chunk that arrived at `t_ns` from now on."""
+        """Compute later stamps relative to a chunk that arrived at `t_ns`."""
         self.chunk_ns = t_ns
 
     def stamp(self, bytes_since: int) -> int:
-        """Return the arrival, monotonic ns, of a byte `bytes_since` bytes before the chunk's end.
+        """Return the arrival of a byte `bytes_since` bytes before the chunk's end, monotonic ns.
 
-        USB devices and ptys are faster than the configured speed: stamps never decrease.
+        USB devices and pseudoterminals are faster than the configured speed, so stamps are limited
+        to never decrease.
         """
         at_ns = self.chunk_ns - round(bytes_since * self._byte_ns)
         self._stamp_ns = max(self._stamp_ns, at_ns)

@@ -1,4 +1,4 @@
-"""Reception of a device on a serial port, over all attempts of its driver."""
+"""Reception of a device on a serial port, across all attempts of its driver."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ if TYPE_CHECKING:
     Start = Callable[[SerialPort, bool], Awaitable[None]]
 
 _HUNT_EVERY = 10
-"""Number of attempts to connect per search at other speeds, which takes longer than an attempt."""
+"""Number of connection attempts per search at other speeds. A search takes longer than an
+attempt."""
 
 
 class SerialReception:
-    """Opens the port of a device, starts the device, and reads.
+    """Opens the port of a device, starts the device, and reads its data.
 
     Parameters
     ----------
@@ -37,10 +38,10 @@ class SerialReception:
         Parameters
         ----------
         emit : callable
-            Receives every chunk after the start.
+            Function that receives every chunk after the start.
         start : callable
-            Makes the device on the open port send. Its second argument is whether it may search for
-            a silent device at other speeds.
+            Function that makes the device on the open port send. Its second argument states whether
+            it may search for a silent device at other speeds.
         """
         settings = self._settings
         with SerialPort(settings.port, settings.baud) as port:

@@ -1,6 +1,7 @@
-"""Reason why a device on a serial line does not answer, with a search at other line speeds.
+"""Finds out why a device on a serial line does not answer, also by a search at other line speeds.
 
-Invariant: a device that answers at another speed continues as before, and nothing is configured.
+Invariant: a device that answers at another speed continues to run as before, and its configuration
+is not changed.
 """
 
 from __future__ import annotations
@@ -16,21 +17,21 @@ if TYPE_CHECKING:
     from jointfit_drivers.serial_conversation import SerialConversation
 
 _LISTEN_S = 0.15
-"""Time at each speed of the search, s."""
+"""Duration of the search at each speed, s."""
 _RESUME_S = 0.5
-"""Longest wait for the device to continue, s."""
+"""Longest wait until the device continues to stream, s."""
 
 
 _LISTEN_FIRST_S = 0.4
-"""Time at each speed, s, for a device that sends without being asked."""
+"""Duration of the search at each speed for a device that sends without a request, s."""
 
 
 class SpeedConversation(Protocol):
-    """Conversation with a device whose speed is unknown."""
+    """Interface of a conversation with a device whose speed is unknown."""
 
     @property
     def understood(self) -> int:
-        """Messages received since the reset."""
+        """Number of messages received since the reset."""
 
     def reset(self) -> None:
         """Discard received bytes."""
@@ -48,14 +49,14 @@ async def find_other_speed(
     Parameters
     ----------
     port, conversation
-        Open port, and the conversation with the device.
+        Open port, and conversation with the device on this port.
     speeds
-        Speeds to search, bit/s.
+        Speeds to search, bit/s, in this order.
     baud
-        Configured speed, which is not searched.
+        Configured speed, which is not searched again.
     answers
-        Returns whether the device answers at the speed of the port. The device then continues to
-        stream as before.
+        Function that returns whether the device answers at the current speed of the port. The
+        device then continues to stream as before.
     """
     for speed in speeds:
         if speed == baud:
@@ -81,29 +82,29 @@ async def explain_silence(
     pause: Callable[[float], Awaitable[object]],
     resume: Callable[[float], Awaitable[object]],
 ) -> NoReturn:
-    """Raise the error for a device that does not answer.
+    """Raise the error that explains why a device does not answer.
 
     Parameters
     ----------
     port, conversation
-        Open port, and the conversation that found no answer.
+        Open port, and conversation without an answer.
     baud
         Configured speed, bit/s.
     speeds
-        Speeds to search.
+        Speeds to search, bit/s.
     hunt
-        Whether to search for a silent device; one whose bytes cannot be decoded is always searched
-        for.
+        Whether to search for a silent device. If the device's bytes cannot be decoded, the other
+        speeds are always searched.
     family
-        Name of its protocol.
+        Name of the device's protocol, for messages.
     pause, resume
-        Ask the device to stop and to continue streaming, and wait for the reply at most as long as
-        given, s; None without a reply.
+        Functions that request the device to stop and to continue streaming. Their argument is the
+        longest wait for the reply, s. They return None if there is no reply.
 
     Raises
     ------
     DeviceLostError
-        The device is silent, or streams and does not answer.
+        The device sends nothing, or it streams but does not answer.
     DeviceMisconfiguredError
         The device answers at another speed, or is of another kind.
     """
@@ -145,14 +146,14 @@ async def explain_missing_messages(
     speeds: Sequence[int],
     family: str,
 ) -> NoReturn:
-    """Raise the error for a device that sends without being asked, and of which no message arrived.
+    """Raise the error for a device that sends without a request, if no message has arrived.
 
-    Nothing is sent. Parameters as for `explain_silence`.
+    The function sends nothing. The parameters are those of `explain_silence`.
 
     Raises
     ------
     DeviceLostError
-        The line is silent, or the device sends other messages only.
+        No bytes arrive, or the device sends only other messages.
     DeviceMisconfiguredError
         The device sends at another speed, or is of another kind.
     """
@@ -168,7 +169,7 @@ async def explain_missing_messages(
         )
 
     async def sends() -> bool:
-        # no message is a reply: nothing that was received at another speed is emitted
+        # Every message is refused as a reply, so that no bytes from other speeds are emitted.
         return await conversation.receive(lambda _: False, _LISTEN_FIRST_S) is not None
 
     speed = await find_other_speed(port, conversation, speeds, baud, sends)

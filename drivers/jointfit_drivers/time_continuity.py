@@ -1,21 +1,22 @@
-"""Clock of a device without a message counter: lost messages, restarts, and undetected corruption.
+"""Clock of a device without message counter: lost messages, restarts, and undetected corruption.
 
-A message *follows* another one if device time did not decrease and advanced by a few periods, or as
-the arrival times did, a backlog included.
+A message *follows* another message if device time did not decrease, and if it advanced by at most a
+few periods or by as much as the arrival times. A backlog of buffered messages is taken into
+account.
 
 | message                                       | outcome                                         |
 |-----------------------------------------------|-------------------------------------------------|
-| follows the last accepted one                 | accepted; messages were lost if device time     |
+| follows the last accepted message             | accepted; messages were lost if device time     |
 |                                               | advanced by more than one and a half periods    |
-| does not follow                               | held until the next one                         |
-| the next one follows the last accepted one    | the held one was corrupt and is dropped         |
-| the next one follows the held one             | both accepted; the clock restarted              |
-| the next one follows neither                  | the held one is dropped, the next one held      |
+| does not follow                               | held until the next message                     |
+| the next follows the last accepted message    | the held message is corrupt and dropped         |
+| the next follows the held message             | both are accepted; the clock restarted          |
+| the next follows neither                      | the held message is dropped, the next is held   |
 
 A checksum passes some corrupt messages, so a single message never proves a restart. The period of
-the stream is determined by three steps of about the same size.
+the stream is determined from three steps of about the same size.
 
-Invariant: integers in, steps out; every input is accepted.
+Invariant: the result depends only on the times fed, and every input is accepted.
 """
 
 from __future__ import annotations
@@ -25,30 +26,30 @@ from typing import NamedTuple
 from jointfit_drivers.backlog import BacklogDelay, device_continued
 
 _FEW = 5
-"""Periods by which device time may advance in any arrival time."""
+"""Number of periods by which device time may advance, whatever the elapsed arrival time is."""
 _GAP = 1.5
-"""Largest step, periods, without a lost message."""
+"""Largest step without a lost message, periods."""
 _ALIKE = 0.3
-"""Largest relative difference of steps without a lost message between them."""
+"""Largest relative difference between two steps without a lost message."""
 _STEPS = 3
-"""Steps that determine the period."""
+"""Number of steps that determine the period."""
 _GAIN = 0.125
-"""Gain of the running mean of the period."""
+"""Weight of a new step in the running mean of the period."""
 _PACE_NS = 250_000_000
-"""Largest difference, ns, of elapsed device and arrival time without a restart or a backlog."""
+"""Largest difference between elapsed device and arrival time without restart or backlog, ns."""
 _LATEST_NS = 30_000_000_000
-"""Longest delay, ns, of the first messages after opening."""
+"""Longest delay of the first messages after opening, ns."""
 
 
 class TimeStep(NamedTuple):
     """Classification of one message."""
 
     lost: int = 0
-    """Number of messages lost before this one."""
+    """Number of messages lost before this message."""
     held: bool = False
-    """Whether this message is to be held until the next message."""
+    """Whether this message must be held until the next message."""
     restarted: bool = False
-    """Whether the held message is valid, comes first, and is the first of a restarted clock."""
+    """Whether the held message is valid and is the first message of a restarted clock."""
 
 
 class _Instant(NamedTuple):
@@ -60,7 +61,7 @@ _CONTINUES, _HELD = TimeStep(), TimeStep(held=True)
 
 
 class TimeContinuity:
-    """Tracks the clock of one device."""
+    """Checks the clock of one device."""
 
     def __init__(self) -> None:
         self._last: _Instant | None = None
@@ -70,14 +71,14 @@ class TimeContinuity:
         self._delay = BacklogDelay()
 
     def add(self, device_ns: int, arrival_ns: int) -> TimeStep:
-        """Return the step of the next message.
+        """Return the classification of the next message.
 
         Parameters
         ----------
         device_ns : int
             Device time of the message, ns.
         arrival_ns : int
-            Arrival time of the message, host monotonic ns.
+            Arrival time of the message, monotonic ns of the host.
         """
         instant = _Instant(device_ns, arrival_ns)
         last, held = self._last, self._held
@@ -99,7 +100,7 @@ class TimeContinuity:
         return TimeStep(restarted=True)
 
     def forget(self) -> None:
-        """Start again with the next message."""
+        """Discard the state, so that the next message is treated as the first."""
         self._last = self._held = None
         self._period_ns, self._first_steps = 0.0, []
         self._delay = BacklogDelay()
@@ -116,7 +117,7 @@ class TimeContinuity:
         )
 
     def _accept(self, last: _Instant, instant: _Instant) -> int:
-        """Store `instant` as the last instant; return the number of messages lost before."""
+        """Store `instant` as the last instant; return the number of messages lost before it."""
         self._last = instant
         step_ns = instant.device_ns - last.device_ns
         self._delay.feed(step_ns, instant.arrival_ns - last.arrival_ns)
@@ -128,7 +129,7 @@ class TimeContinuity:
                 self._first_steps.clear()
             return 0
 
-        # The first period, or another one, counts from its third step on.
+        # A first or a different period is used from its third step on.
         steps = self._first_steps
         if steps and abs(step_ns - steps[0]) > _ALIKE * steps[0]:
             steps.clear()

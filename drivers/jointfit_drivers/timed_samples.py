@@ -1,9 +1,9 @@
 """Samples of an IMU that sends device time in nanoseconds and no message counter.
 
-`TimedSamples` checks the time of each reading, the norm of its quaternion and the plausibility of
-its raw measurements, and reports losses, restarts and faults as device events.
+`TimedSamples` checks the time of each reading, the norm of its quaternion, and the plausibility of
+its raw measurements. It reports losses, restarts and faults as device events.
 
-Invariant: the output depends only on the readings added; no clock and no port is read.
+Invariant: the output depends only on the readings added. The module reads no clock and no port.
 """
 
 from __future__ import annotations
@@ -34,34 +34,38 @@ class RawVectors(NamedTuple):
     force: Vector
     """Specific force, m/s^2."""
     magnetic: Vector | None = None
-    """Magnetic field, any unit."""
+    """Magnetic field in any unit; None if not measured."""
 
 
 class TimedReading(NamedTuple):
-    """Content of one message: an orientation or raw measurements; neither if invalid."""
+    """Content of one message: an orientation or raw measurements.
+
+    An invalid message has neither.
+    """
 
     size: int
     """Length on the wire, bytes."""
     arrival_ns: int
     ticks: int | None
-    """Device time, ns; None without one."""
+    """Device time, ns; None if the message contains none."""
     q_world_sensor: Quaternion | None = None
-    """Sensor to ENU, any norm."""
+    """Orientation q_world_sensor in an ENU world, with any norm."""
     q_native: Quaternion | None = None
-    """Quaternion as sent."""
+    """Quaternion as sent by the device."""
     status: int | None = None
     raw: RawVectors | None = None
 
 
 class TimedSamples(Refusals):
-    """Computes the samples of one device.
+    """Computes the samples of one device from its readings.
 
     Parameters
     ----------
     make_raw : callable, optional
-        Returns a new filter of raw measurements; None if the device sends orientations.
+        Function that returns a new filter of raw measurements; None if the device sends
+        orientations.
     untimed_remedy : str
-        Remedy for readings without time.
+        Remedy for readings without time, for messages.
     """
 
     def __init__(self, make_raw: Callable[[], RawSamples] | None, untimed_remedy: str) -> None:
@@ -84,7 +88,7 @@ class TimedSamples(Refusals):
                 text = f"orientation without time in its message: {self._untimed_remedy}"
                 out.append(DeviceEvent("warning", text))
 
-            # Stamped with its arrival, unless others have a time.
+            # A reading without time is stamped with its arrival, unless other readings have a time.
             if self._timed or self._make_raw is not None:
                 return [*out, self.refuse(reading.size, "orientation without time")]
             return out + self._samples(reading)
@@ -111,7 +115,7 @@ class TimedSamples(Refusals):
 
     @override
     def flush(self) -> list[Decoded]:
-        """Reject a reading that no later one confirmed."""
+        """Reject a reading that no later reading confirmed."""
         held, self._held = self._held, None
         return [] if held is None else [self.refuse(held.size, "time disagrees with the others")]
 
@@ -139,7 +143,7 @@ class TimedSamples(Refusals):
                 ImuSample(reading.arrival_ns, q, native, reading.ticks, None, reading.status)
             )
 
-        # Warn once if hardly any quaternion has norm 1.
+        # Warn once if hardly any quaternion has the norm 1.
         if not self._norm_checked:
             self._norm_checked, norm = self._gate.judged, self._gate.misconfigured_norm
             if norm is not None:

@@ -116,7 +116,7 @@ class QtmPoseConverter:
     def _segments(
         self, component: SkeletonComponent, poses: dict[int, tuple[Vector, Quaternion]]
     ) -> int:
-        """Add the segments of skeletons to `poses`; return the number of suspicious ones."""
+        """Add the poses of skeleton segments to `poses`; return the number of rejected poses."""
         suspicious = 0
         for number, segments in enumerate(component.skeletons):
             for segment in segments:

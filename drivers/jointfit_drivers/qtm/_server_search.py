@@ -1,7 +1,7 @@
-"""Search for QTM servers: discovery in a network by UDP, connection to a named host by TCP.
+"""Search for QTM servers: by UDP discovery in a network, or by a TCP connection to a named host.
 
-A named host is also asked for its settings, so that the names of its rigid bodies and markers are
-known.
+The settings of a named host are requested as well, because they contain the names of its rigid
+bodies and markers.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 DISCOVERY_PORT = 22226
 """UDP port on which QTM answers discovery requests."""
 _TRIES = 3
-"""Number of discovery requests sent to each network, because a datagram may be lost."""
+"""Number of discovery requests sent to each network, because datagrams may be lost."""
 
 
 class _Announcements(asyncio.DatagramProtocol):
-    """Replies received at one local address, keyed by the address of the server."""
+    """Replies received at one local address, by the address of the server."""
 
     def __init__(self) -> None:
         self.servers: dict[str, qtm.ServerAnnouncement] = {}
@@ -45,7 +45,7 @@ class _Announcements(asyncio.DatagramProtocol):
 
     @override
     def error_received(self, exc: Exception) -> None:
-        """Ignore ICMP errors such as "port unreachable": such a host does not answer."""
+        """Ignore ICMP errors such as "port unreachable", because such a host does not answer."""
 
 
 async def find_servers(
@@ -68,7 +68,7 @@ async def find_servers(
 
 
 async def _ask_host(settings: QtmSettings, route: Route, wait_s: float) -> list[FoundServer]:
-    """Return the server at an address with the names in its settings; empty without an answer."""
+    """Return the server at an address with the names in its settings; empty if it is silent."""
     described = asyncio.Event()
     found: list[qtm.QtmSettingsXml] = []
 
@@ -102,7 +102,7 @@ async def _ask_host(settings: QtmSettings, route: Route, wait_s: float) -> list[
 
 
 async def _ask_network(local: str, address: str, wait_s: float) -> list[FoundServer]:
-    """Return the servers in the network of one card."""
+    """Return the servers that answer in the network of one card."""
     loop = asyncio.get_running_loop()
     transport, answers = await loop.create_datagram_endpoint(
         _Announcements, local_addr=(local, 0), allow_broadcast=True

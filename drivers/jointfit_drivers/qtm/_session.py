@@ -1,14 +1,17 @@
 """One connection to a QTM server, from its greeting to silence.
 
-1. Greeting, then ``Version``, from 1.25 down to 1.19.
-2. ``GetState``, and ``GetParameters`` every second until QTM has parameters.
-3. ``StreamFrames``, which has no answer: frames follow, or "no more data" while QTM waits.
+1. QTM sends a greeting. The session then sends ``Version`` for each version from 1.25 down to 1.19,
+   until QTM accepts one.
+2. It sends ``GetState``, and ``GetParameters`` every second until QTM has parameters.
+3. It sends ``StreamFrames``, which has no answer. Frames follow, or "no more data" while QTM waits
+   for a measurement.
 
-Every packet is emitted, in order of arrival, so that a replay has the same input. The receiver of
-the chunks decodes the frames. This module decodes one frame a second, to check that it fits the
-settings.
+Every packet is emitted in the order of arrival, so that a replay has the same input. The receiver
+of the chunks decodes the frames. Once per second this module decodes one frame, to check that it
+fits the settings.
 
-Invariant: one command awaits its answer at a time. Events, errors and frames may arrive before it.
+Invariant: at most one command waits for its answer. Events, errors and frames may arrive before the
+answer.
 """
 
 from __future__ import annotations
@@ -34,9 +37,9 @@ if TYPE_CHECKING:
 ANSWER_S = 3.0
 """Longest wait for the answer to a command, s."""
 RETRY_S = 1.0
-"""Interval between requests for parameters, and between checks of a whole frame, s."""
+"""Interval between requests for parameters, and between checks of complete frames, s."""
 RESUME_S = 2.0
-"""Time after the start of a measurement without frames, s, before they are requested again."""
+"""Time after the start of a measurement after which missing frames are requested again, s."""
 VERSIONS = tuple(f"1.{minor}" for minor in range(25, 18, -1))
 """Versions of the protocol that the driver requests, in order of preference."""
 GREETING = "QTM RT Interface connected"
@@ -51,7 +54,7 @@ _STARTING_EVENTS = {QtmEvent.CAPTURE_STARTED, QtmEvent.RT_FROM_FILE_STARTED}
 
 
 class QtmSession:
-    """One connection; after a loss, a new one is made.
+    """One connection. After a loss, the driver creates a new session.
 
     Parameters
     ----------
@@ -60,9 +63,9 @@ class QtmSession:
     route : Route
         Addresses of the server and of this host's network card.
     emit : Emit
-        Receives every packet of the server.
+        Function that receives every packet of the server.
     output : ServerOutput, optional
-        Output of the earlier connections.
+        Output that is shared with the earlier connections.
     """
 
     def __init__(
@@ -73,7 +76,7 @@ class QtmSession:
         self._output = output or ServerOutput()
         self._output.begin(emit)
         self.version: str | None = None
-        """Version of the protocol in use."""
+        """Protocol version in use."""
         self._name = f"QTM server {settings.server}:{settings.command_port}"
         self._link = TcpLink(self._name, f"{START}, and check command_port", self._read)
         self._stream = qtm.QtmStream()
@@ -86,9 +89,9 @@ class QtmSession:
         self._frame_ns = self._next_check_ns = 0
 
     async def run(self) -> None:
-        """Connect and read until cancelled; raises the errors of `QtmMocap.run`."""
+        """Connect and read until cancelled. The errors are those of `QtmMocap.run`."""
         with self._link as link:
-            # The data port is bound before QTM is asked to send there.
+            # The data port must be bound before QTM is requested to send to it.
             udp_port = None
             if self._settings.transport == "udp":
                 port = self._settings.data_port or 0
@@ -163,7 +166,10 @@ class QtmSession:
         self._link.wake()
 
     def _check_frame(self, chunk: Chunk) -> None:
-        """Decode one frame a second; request the settings that it does not fit."""
+        """Decode one frame per second.
+
+        If it does not fit the settings, request the settings again.
+        """
         self._frame_ns = chunk.t_ns
         described = self._described
         if chunk.t_ns < self._next_check_ns or described is None:
@@ -216,7 +222,7 @@ class QtmSession:
         )
 
     async def _ask(self, command: str, *kinds: type) -> qtm.Message:
-        """Send a command and return its answer, the first message of one of these types."""
+        """Send a command; return its answer, the first message of one of these types."""
         self._answers.clear()
         self._link.send(qtm.encode(qtm.Command(command)))
         return await self._answer(kinds, command)
@@ -240,7 +246,7 @@ class QtmSession:
                     raise
 
     def _request_frames(self, udp_port: int | None) -> None:
-        # Frames follow, or "no more data", or an error: there is no answer.
+        # This command has no answer. Frames follow, or "no more data", or an error.
         to = "" if udp_port is None else f"UDP:{udp_port} "
         parts = "6DRes 3DRes Timecode" + " Skeleton:global" * self._settings.skeleton
         self._link.send(qtm.encode(qtm.Command(f"StreamFrames AllFrames {to}{parts}")))
@@ -280,7 +286,7 @@ class QtmSession:
             await self._link.pause(min(wait_s, RETRY_S / 2) if self._parameters_wanted else wait_s)
 
     def _check_alive(self, last_ns: int, udp_port: int | None) -> None:
-        """Raise DeviceLostError without frames, except while QTM waits for a measurement."""
+        """Raise DeviceLostError if no frames arrive, except while QTM waits for a measurement."""
         if self._waiting or (time.monotonic_ns() - last_ns) / 1e9 < self._settings.silence_s:
             return
         self._output.silent = True

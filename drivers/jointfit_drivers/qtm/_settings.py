@@ -9,7 +9,7 @@ from pydantic import Field
 from jointfit_drivers.motion_capture import ServerSettings
 
 PORT = 22223
-"""Usual port of the little-endian protocol: the base port of QTM (22222) plus 1."""
+"""Default port of the little-endian protocol, which is the base port of QTM (22222) plus 1."""
 
 
 class QtmSettings(ServerSettings):

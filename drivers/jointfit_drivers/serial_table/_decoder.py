@@ -1,10 +1,10 @@
-"""Decoder of the serial-table driver: chunks in, samples in SI units out.
+"""Decoder of the driver serial-table: converts chunks to samples in SI units.
 
-A sample is stamped with the arrival of its first byte. On a serial line this is the arrival of the
-chunk minus the duration of the frame and of the bytes behind it, at ten bits per byte. On USB it is
-the arrival of the chunk.
+The stamp of a sample is the arrival of its first byte. On a serial line, this is the arrival of the
+chunk minus the duration of the frame and of all later bytes in the chunk, at ten bits per byte. On
+USB, it is the arrival of the chunk.
 
-Invariant: the output depends only on the chunks fed; the decoder reads no clock and no port.
+Invariant: the output depends only on the chunks fed. The decoder reads no clock and no port.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def open_codec(wire: FrameFormat | LineFormat) -> FrameCodec | LineCodec:
-    """Return a new codec for a description."""
+    """Return a new codec for the description of a frame or line."""
     return LineCodec(wire) if isinstance(wire, LineFormat) else FrameCodec(wire)
 
 
@@ -32,9 +32,9 @@ class SerialTableDecoder(SerialMessageDecoder[TableMessage]):
     Parameters
     ----------
     wire : FrameFormat or LineFormat
-        Description of its messages.
+        Layout of the device's messages.
     form : SampleForm
-        Meaning of their numbers.
+        Meaning of the numbers in the messages.
     baud : int, optional
         Line speed, bit/s, for back-dating of stamps; None for USB.
     """
@@ -45,7 +45,7 @@ class SerialTableDecoder(SerialMessageDecoder[TableMessage]):
 
     @property
     def tick_clock(self) -> TickClock | None:
-        """Unit and modulus of the device time; None without one."""
+        """Unit and modulus of the device time; None if the device sends no time."""
         return self._samples.tick_clock
 
     @override

@@ -1,7 +1,8 @@
 """Driver of IMUs on a serial port that rig.toml describes.
 
-The driver only receives: a table does not describe how a device is configured. Data without any
-message are a fault of the table or of the speed; the error describes the received bytes.
+The driver sends nothing, because a table does not describe how a device is configured. If the
+received data contain no message, the table or the speed is wrong. The error then describes the
+received bytes.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ log = logging.getLogger(__name__)
 _UNKNOWN_BYTES = 4096
 """Number of bytes without a message after which the table counts as wrong."""
 _UNKNOWN_S = 2.0
-"""Time, s, of received bytes without a message after which the table does not fit."""
+"""Time with received bytes but without a message after which the table counts as wrong, s."""
 _RAW_CHUNKS = 20
-"""Chunks logged at debug level, so that the log contains raw data of a device."""
+"""Number of chunks logged at debug level, so that the log contains raw data of a device."""
 
 
 class SerialTableImu:
@@ -53,7 +54,8 @@ class SerialTableImu:
         DeviceLostError
             The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            The file is not a serial port, or the received bytes contain no message of the table.
+            The file is not a serial port, or the received bytes contain no message as the table
+            describes.
         """
         settings = self._settings
         with SerialPort(settings.port, settings.baud) as port:
@@ -63,7 +65,7 @@ class SerialTableImu:
             await port.pump(emit, settings.lost_after_s)
 
     async def _first_message(self, port: SerialPort) -> list[Chunk]:
-        """Return the chunks up to the first message with measurements."""
+        """Return the chunks up to and including the first message with measurements."""
         wire, silence_s = self._settings.wire_format(), self._settings.lost_after_s
         codec, chunks = open_codec(wire), []
         received = 0

@@ -1,6 +1,6 @@
-"""Differences between received bytes and the table that describes them, with the remedy.
+"""Description of the differences between received bytes and the table, with the remedy.
 
-Invariant: a pure function of bytes; every input yields a text.
+Invariant: the functions are pure, and return a text for every input.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ if TYPE_CHECKING:
     from jointfit_protocols.table import ByteOrder
 
 _SHARE = 0.5
-"""Share of the sync bytes, or lines, that a finding must explain."""
+"""Smallest share of the sync bytes, or of the lines, that a finding must explain."""
 _FEW = 3
-"""Number of frames that is needed for a finding."""
+"""Smallest number of frames for a finding."""
 _PRINTABLE = 0.95
-"""Share of printable characters in text."""
+"""Smallest share of printable characters in text."""
 _NAMED = 8
-"""Types of frames listed in a message."""
+"""Largest number of frame types listed in a message."""
 _SHOWN = 24
-"""Number of bytes that an error message shows."""
+"""Number of bytes displayed in an error message."""
 
 
 def explain_bytes(data: bytes, wire: FrameFormat | LineFormat) -> str:
-    """Return why `data` contains no message of `wire`, with the key to change."""
+    """Return why `data` contain no message of the format `wire`, with the key to change."""
     is_text = sum(32 <= byte < 127 or byte in b"\r\n\t" for byte in data) >= _PRINTABLE * len(data)  # noqa: PLR2004 - ASCII
     if isinstance(wire, LineFormat):
         return _explain_lines(data, wire) if is_text else _NOT_TEXT.format(_shown(data))
@@ -70,7 +70,7 @@ def _explain_lines(data: bytes, wire: LineFormat) -> str:
 
 
 def _likely_separator(lines: Sequence[bytes], wire: LineFormat) -> str | None:
-    """Return the separator of most lines if the configured one is in none of them."""
+    """Return the separator of most lines if no line contains the configured separator."""
     if any(len(_cells(line, wire)) > 1 for line in lines):
         return None
     start = len(wire.prefix)
@@ -123,7 +123,7 @@ def _explain_frames(data: bytes, wire: FrameFormat) -> str:
 def _length_finding(
     data: bytes, starts: Sequence[int], spacing: int, wire: FrameFormat
 ) -> str | None:
-    """Return the difference between the length of the table and the length of the frames."""
+    """Return the difference between the frame length in the table and in the data."""
     if isinstance(wire.length, int):
         if spacing == wire.length:
             return None
@@ -141,7 +141,7 @@ def _length_finding(
 
 
 def _is_valid(frame: bytes, checksum: Checksum, wire: FrameFormat) -> bool:
-    """Return whether a frame ends in this checksum."""
+    """Return whether a frame ends with a correct checksum of this type."""
     stop = len(frame) - len(wire.end)
     checked = stop - checksum.width
     sent = int.from_bytes(frame[checked:stop], checksum.byte_order)
@@ -149,7 +149,7 @@ def _is_valid(frame: bytes, checksum: Checksum, wire: FrameFormat) -> bool:
 
 
 def _usual_checksums(sync: int) -> Iterator[Checksum]:
-    """Yield the checksums that many devices have."""
+    """Yield the types of checksums that many devices use."""
     for first in dict.fromkeys((0, sync, 1, 2, 3)):
         for kind, width in WIDTHS.items():
             orders: tuple[ByteOrder, ...] = ("little", "big") if width > 1 else ("little",)
@@ -169,7 +169,7 @@ def _usual_checksums(sync: int) -> Iterator[Checksum]:
 
 
 def _described(checksum: Checksum) -> str:
-    """Return the keys of a checksum that differ from their defaults."""
+    """Return the keys of a checksum whose values differ from the defaults."""
     plain = Checksum(checksum.kind)
     keys = [f'kind = "{checksum.kind}"']
     for name, value in checksum._asdict().items():

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 _MOST_COLUMNS = 256
 _BITS = 10
-"""Bits of one byte on the line, 8N1."""
+"""Number of bits of one byte on the line (8N1)."""
 
 
 class SerialFieldSettings(FieldSettings):
@@ -75,7 +75,7 @@ class NumberSettings(Settings):
     )
 
     def place(self, byte_order: Literal["little", "big"]) -> TableField | None:
-        """Return its place; None if the type is no integer."""
+        """Return the position of the number; None if its type is not an integer."""
         parsed = parse_type(self.type)
         if parsed is None or parsed[0] == "f":
             return None
@@ -159,7 +159,7 @@ class SerialTableSettings(SerialImuSettings, TableImuSettings):
 
     @override
     def contradictions(self) -> Iterator[tuple[str, str]]:
-        """Refuse tables whose fields do not fit their frame."""
+        """Yield the keys whose fields do not fit the frame."""
         if (self.frame is None) == (self.text is None):
             if self.frame is None:
                 yield "frame", "missing: add a `frame` table (binary) or a `text` table (lines)"
@@ -178,16 +178,16 @@ class SerialTableSettings(SerialImuSettings, TableImuSettings):
             yield from orientation_faults(form, self, timed=True)
 
     def places(self) -> TableForm:
-        """Return the place of every number."""
+        """Return the position of every number in the frame or line."""
         quantities: Any = dict(self.fields)
         return place_fields(quantities, self._place_part)
 
     def sample_form(self) -> SampleForm:
-        """Return the meaning of the numbers."""
+        """Return the meaning of the numbers in the frame or line."""
         return sample_form(self.places(), self, is_text=self.text is not None)
 
     def wire_format(self) -> FrameFormat | LineFormat:
-        """Return the description of the frames or lines for their codec."""
+        """Return the layout of the frames or lines for the codec."""
         fields = self.places().fields
         if self.frame is None:
             text = self.text or TextSettings()
@@ -217,7 +217,7 @@ class SerialTableSettings(SerialImuSettings, TableImuSettings):
         )
 
     def _place_part(self, name: Quantity, part: FieldSettings, count: int) -> list[TableField]:
-        """Return the places of a part; columns have the form of places."""
+        """Return the positions of a field. Columns of text lines have the same form."""
         del name
         column = getattr(part, "column", None)
         if self.text is None:
@@ -279,7 +279,7 @@ class SerialTableSettings(SerialImuSettings, TableImuSettings):
 
 
 def _is_readable(settings: Any) -> bool:
-    """Return whether no key that places fields had a fault; such keys are None."""
+    """Return whether all keys that define field positions are valid; keys with faults are None."""
     fields, frame, text = settings.fields, settings.frame, settings.text
     if fields is None or settings.byte_order is None or settings.rate_hz is None:
         return False

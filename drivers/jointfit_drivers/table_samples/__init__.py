@@ -1,4 +1,4 @@
-"""Samples of devices that a table of rig.toml describes: keys, places, units and plausibility."""
+"""Samples of devices that a table in rig.toml describes: keys, layout, units and plausibility."""
 
 from jointfit_drivers.table_samples._continuity import RecordContinuity
 from jointfit_drivers.table_samples._field_settings import (

@@ -1,7 +1,7 @@
-"""Time and counter of a device described by a table: losses, restarts, and corrupt values.
+"""Time and counter of a device that a table describes: losses, restarts, and corrupt values.
 
-With d the step of device time, c the step of the counter (modulo its width) and P the measured
-period of a sample:
+In the table, d is the step of device time, c is the step of the counter (modulo its width), and P
+is the measured sample period:
 
 | finding                                                  | outcome                          |
 |----------------------------------------------------------|----------------------------------|
@@ -10,10 +10,11 @@ period of a sample:
 | of the arrivals                                          | samples lost                     |
 | no time, c forward                                       | c - 1 samples lost               |
 | otherwise                                                | the sample is held               |
-| the next one continues the held one                      | the device restarted             |
-| the next one continues the last accepted one             | the held one was corrupt         |
+| the next sample continues the held one                   | the device restarted             |
+| the next sample continues the last accepted one          | the held one was corrupt         |
 
-Invariant: a function of the values fed, without a clock of its own; every input is accepted.
+Invariant: the result depends only on the values fed. The module reads no clock, and accepts every
+input.
 """
 
 from __future__ import annotations
@@ -22,33 +23,35 @@ from statistics import median
 from typing import NamedTuple
 
 _LEARNED = 10
-"""Steps after which the measured period is used."""
+"""Number of steps after which the measured period is used."""
 _SLACK_COUNTS = 2
 _SLACK_SHARE = 0.01
 _SHORT = 100
-"""Longest gap, samples, that needs no confirmation by the arrivals."""
+"""Longest gap that the arrivals need not confirm, samples."""
 _LATE_NS = 500_000_000
-"""Largest difference between the steps of device time and of the arrivals over a gap, ns."""
+"""Largest difference between device time and arrival time over a gap, ns."""
 _LATE_SHARE = 0.02
 _AMBIGUOUS = 0.05
-"""A count confirms nothing if its tolerance exceeds this share of the counter's values."""
+"""Share of the counter's values. If the tolerance of a step is larger, the counter confirms
+nothing."""
 _FASTER = 4.0
-"""Factor by which messages that waited may arrive faster than their rate."""
+"""Largest factor by which buffered messages may arrive faster than their rate."""
 
 
 class RecordStep(NamedTuple):
     """Classification of one sample."""
 
     lost: int = 0
-    """Samples lost before it, or before the held one if that is confirmed."""
+    """Number of samples lost before this sample, or before the held sample if it is confirmed."""
     restarted: bool = False
     """Whether the device restarted before the held sample."""
     held: bool = False
-    """Whether this sample waits for the next sample."""
+    """Whether this sample must wait for the next sample."""
     confirmed: bool = False
-    """Whether the held sample is valid and comes first; otherwise it is dropped."""
+    """Whether the held sample is valid and must be used before this one; otherwise it is
+    dropped."""
     lost_since: int = 0
-    """Samples lost between the held one and this one."""
+    """Number of samples lost between the held sample and this sample."""
 
 
 class _Point(NamedTuple):
@@ -62,7 +65,7 @@ _HELD = RecordStep(held=True)
 
 
 class RecordContinuity:
-    """Tracks time and counter of one device.
+    """Checks time and counter of one device.
 
     Parameters
     ----------
@@ -71,7 +74,7 @@ class RecordContinuity:
     tick_ns : float
         Duration of a tick of device time, ns.
     modulus, counts : int, optional
-        Number of values of device time and of the counter; None: it never wraps.
+        Number of values of device time and of the counter; None if the value never wraps.
     """
 
     def __init__(
@@ -85,7 +88,7 @@ class RecordContinuity:
         self._held: _Point | None = None
 
     def take(self, ticks: int | None, counter: int | None, arrival_ns: int) -> RecordStep:
-        """Return the step for the next sample."""
+        """Return the classification of the next sample."""
         point = _Point(ticks, counter, arrival_ns)
         last, held = self._last, self._held
         if last is None:
@@ -134,7 +137,7 @@ class RecordContinuity:
         return c if abs(c - expected) <= slack else None
 
     def _learn(self, d: int, c: int | None) -> int | None:
-        """Return the number of samples in one of the first steps, and measure the period."""
+        """Return the number of samples in one of the first steps; update the measured period."""
         most = _SHORT * self._period_ns / self._tick_ns
         if d > most or (c is not None and c > _SHORT):
             return None
@@ -145,14 +148,14 @@ class RecordContinuity:
         return 1 if c is None else c
 
     def _count(self, last: _Point, point: _Point) -> int | None:
-        """Return the step of the counter; None if one of the samples has none."""
+        """Return the step of the counter; None if one of the samples has no counter."""
         if last.counter is None or point.counter is None:
             return None
         step = point.counter - last.counter
         return step if self._counts is None else step % self._counts
 
     def _counted(self, c: int | None, elapsed_ns: int) -> int | None:
-        """Return the number of samples by the counter alone."""
+        """Return the number of samples according to the counter alone."""
         if c is None:
             return 1
         samples = elapsed_ns / self._period_ns

@@ -1,4 +1,4 @@
-"""Keys of ``fields`` in the ``[[imu]]`` table of a self-described device."""
+"""Keys of ``fields`` in the ``[[imu]]`` table of a device that the table describes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jointfit_drivers.gateway_orientation import GatewaySettings
 from jointfit_protocols.table import WIDTHS, Checksum, ChecksumKind
 
 _MOST_BYTES = 4095
-"""Largest offset in a frame."""
+"""Largest offset of a field in a frame, bytes."""
 
 
 class FieldSettings(Settings):
@@ -65,9 +65,10 @@ class FieldSettings(Settings):
 
 
 def as_parts(value: Any) -> Any:
-    """Return an array for a table: a quantity may be sent in several parts.
+    """Return `value` as an array, because a quantity may be sent in several parts.
 
-    Arrays become tuples, because pydantic no longer sees that they were JSON.
+    Arrays are converted to tuples, because pydantic does not know at this point that they come from
+    JSON.
     """
     if isinstance(value, (list, tuple)):
         return tuple(as_parts(each)[0] if isinstance(each, dict) else each for each in value)
@@ -78,7 +79,7 @@ def as_parts(value: Any) -> Any:
 
 
 def parts_of(field: type[Settings]) -> BeforeValidator:
-    """Return the validator of a quantity: the table of one field, or an array of them."""
+    """Return the validator of a quantity, which accepts one table or an array of tables."""
     either = field | tuple[field, ...]  # type: ignore[valid-type]  # a type at run time
     return BeforeValidator(as_parts, json_schema_input_type=either)
 
@@ -103,12 +104,12 @@ class ChecksumSettings(Settings):
     modulus: Literal[255, 256] = Field(256, description="of fletcher16")
 
     def checksum(self, byte_order: Literal["little", "big"]) -> Checksum:
-        """Return the parameters, with `byte_order` unless the table has one."""
+        """Return the parameters of the checksum; `byte_order` is the default of its byte order."""
         keys = self.model_dump()
         return Checksum(**keys | {"byte_order": self.byte_order or byte_order})
 
     def faults(self) -> list[tuple[str, str]]:
-        """Return values that exceed the width of the checksum."""
+        """Return the keys whose values exceed the width of the checksum."""
         if None in (self.kind, self.init, self.xor_out):
             return []
         most = 1 << 8 * WIDTHS[self.kind]
@@ -120,7 +121,7 @@ class ChecksumSettings(Settings):
 
 
 class TableImuSettings(GatewaySettings):
-    """Common keys of devices that a table describes."""
+    """Common keys of all devices that a table describes."""
 
     byte_order: Literal["little", "big"] = Field(
         "little", description="byte order of fields that name none"

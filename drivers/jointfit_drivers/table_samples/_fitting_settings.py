@@ -1,10 +1,10 @@
-r"""Settings of a table that fit the data, if the configured ones do not.
+r"""Search for settings of a table that fit the data, if the configured settings do not.
 
-Quaternions have norm 1, and specific forces have the norm of gravity most of the time. With a wrong
-byte order or type the norms of the counts scatter; with a wrong scale only, they do not, and their
-median is the scale.
+Quaternions have the norm 1, and specific forces have the norm of gravity most of the time. If byte
+order or type are wrong, the norms of the raw counts vary. If only the scale is wrong, the norms are
+constant, and their median is the scale.
 
-Invariant: pure arithmetic on received numbers.
+Invariant: the result depends only on the received numbers.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ if TYPE_CHECKING:
     from jointfit_protocols.table import Quantity, TableField
 
 _NEAR = {"quaternion": 0.02, "acceleration": 0.3}
-"""Largest deviation from the median norm, relative: accelerations contain motion."""
+"""Largest relative deviation from the median norm. Accelerations include motion."""
 _SHARE = 0.8
-"""Share of the norms that are near the median if byte order and type are correct."""
+"""Smallest share of norms near the median with a correct byte order and type."""
 _DIVISORS = (
     1.0, 100.0, 256.0, 1000.0, 1024.0, 2048.0, 4096.0, 8192.0, 10_000.0, 16_384.0, 32_767.0,
     32_768.0, 100_000.0, 1_000_000.0, float(1 << 30), float((1 << 31) - 1),
 )  # fmt: skip
-"""Counts per unit of existing devices."""
+"""Numbers of counts per unit that devices use."""
 _SNAP = {"quaternion": 0.01, "acceleration": 0.12}
-"""Largest deviation, relative, with which one of these is proposed instead of the measured one."""
+"""Largest relative deviation from one of these numbers with which it replaces the measured one."""
 _KNOWN_SCALE = 1e-9
 
 
@@ -41,21 +41,21 @@ def fitting_keys(
     fields: Mapping[int, TableField] | None,
     samples: Sequence[tuple[tuple[bytes, ...], tuple[float, ...]]],
 ) -> str | None:
-    """Return the keys of ``fields.QUANTITY`` with which the data fit, as text of rig.toml.
+    """Return the keys of ``fields.QUANTITY`` that fit the data, as text for rig.toml.
 
     Parameters
     ----------
     quantity
-        ``quaternion`` or ``acceleration``.
+        Quantity to check, ``quaternion`` or ``acceleration``.
     fields
-        Place of each slot of the record; None for text lines.
+        Position of each slot of the record; None for text lines.
     samples
-        Data of the frames of each sample, and its components as sent.
+        Bytes of the frames of each sample, and the sample's components as sent.
 
     Returns
     -------
     str or None
-        None if no change of byte order, type and scale explains the data.
+        Text for rig.toml; None if no change of byte order, type and scale explains the data.
     """
     target = 1.0 if quantity == "quaternion" else GRAVITY
     if fields is None:
@@ -82,7 +82,7 @@ def fitting_keys(
 def _candidates(
     fields: Sequence[TableField],
 ) -> Iterator[tuple[dict[str, str], list[TableField]]]:
-    """Yield changes of type and byte order, the configured ones first."""
+    """Yield combinations of type and byte order, beginning with the configured combination."""
     first = fields[0]
     kinds = dict.fromkeys((first.kind, "i", "f" if first.bits in {32, 64} else "i"))
     orders = dict.fromkeys((first.byte_order, "little", "big"))
@@ -103,7 +103,7 @@ def _norm(counts: Sequence[float]) -> float:
 
 
 def _typical(norms: Sequence[float], quantity: Quantity) -> float | None:
-    """Return the median norm if most norms are near it."""
+    """Return the median norm if most norms are near it; None otherwise."""
     finite = [norm for norm in norms if isfinite(norm)]
     if not finite:
         return None

@@ -1,6 +1,6 @@
 """Checks of a table against the first data: scale, byte order, type and units, with the remedy.
 
-Invariant: a function of the records fed; every check reports at most once.
+Invariant: the result depends only on the records fed. Every check reports at most once.
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ if TYPE_CHECKING:
     from jointfit_protocols.table import Quantity
 
 _JUDGED = 100
-"""Records after which scale and byte order are evaluated."""
+"""Number of records after which scale and byte order are checked."""
 _ROUND = 0.05
 """Largest deviation of the median norm of quaternions from 1."""
 _LIGHT, _HEAVY = 6.0, 14.0
-"""Range of the median specific force, m/s^2; outside, its scale is wrong."""
+"""Plausible range of the median specific force, m/s^2. Outside of it, the scale is wrong."""
 _GOOD, _CALM = 0.75, 0.5
-"""Least shares of quaternions and specific forces whose norm is in range."""
+"""Smallest shares of quaternions and of specific forces whose norm is in range."""
 _TIMED = 200
-"""Records after which the unit of device time is evaluated."""
+"""Number of records after which the unit of device time is checked."""
 _TIMED_NS = 2_000_000_000
-"""Least time of the arrivals over which it is evaluated, ns."""
+"""Shortest time between arrivals over which the unit of device time is checked, ns."""
 _FASTEST = 1.5
-"""Ratio of device time and host time, or its inverse, from which on the unit is wrong."""
+"""Ratio of device time to host time, or its inverse, from which the unit is wrong."""
 
 _Sample = tuple[tuple[bytes, ...], tuple[float, ...], tuple[float, ...]]
 
 
 class PlausibilityChecks:
-    """Checks of one device.
+    """Plausibility checks of one device.
 
     Parameters
     ----------
     form : SampleForm
         Meaning of the numbers.
     places : mapping
-        Components of each quantity among the measured ones.
+        Indices of the components of each quantity among the measured components.
     """
 
     def __init__(self, form: SampleForm, places: Mapping[Quantity, slice]) -> None:
@@ -58,16 +58,16 @@ class PlausibilityChecks:
 
     @property
     def done(self) -> bool:
-        """Whether all checks ended."""
+        """Whether all checks have ended."""
         return self._samples is None and self._time_done and self._rates is None
 
     def take(
         self, record: TableRecord, si: tuple[float, ...], ticks: int | None
     ) -> list[DeviceEvent]:
-        """Return the findings after the next record, whose components are `si` in SI units."""
+        """Return the findings after the next record, whose components in SI units are `si`."""
         out: list[DeviceEvent] = []
         if self._samples is not None:
-            # all components were received, because a record without measurements is none
+            # All components are known, because a record without measurements is not passed here.
             values = cast("tuple[float, ...]", record.values)
             self._samples.append((record.data, values, si))
             if len(self._samples) >= _JUDGED:
@@ -80,11 +80,11 @@ class PlausibilityChecks:
         return out
 
     def forget(self) -> None:
-        """Start the check of device time again: the device restarted."""
+        """Start the check of device time again, because the device restarted."""
         self._first, self._timed = None, 0
 
     def _judge(self, samples: Sequence[_Sample]) -> list[DeviceEvent]:
-        """Return the quantities whose norm is wrong."""
+        """Return warnings about the quantities whose norm is wrong."""
         checks: dict[Quantity, tuple[Callable[[float], bool], float]] = {
             "quaternion": (lambda norm: abs(norm - 1) <= _ROUND, _GOOD),
             "acceleration": (lambda norm: _LIGHT <= norm <= _HEAVY, _CALM),
@@ -107,7 +107,7 @@ class PlausibilityChecks:
         norm: float,
         samples: Sequence[tuple[tuple[bytes, ...], tuple[float, ...]]],
     ) -> DeviceEvent:
-        """Return the report of a quantity whose norm is wrong."""
+        """Return the warning about a quantity whose norm is wrong."""
         expected = "1" if quantity == "quaternion" else "9.81 m/s2"
         text = f"median norm of the {quantity} is {norm:.4g}, expected {expected}"
         keys = fitting_keys(quantity, self._form.fields, samples)
@@ -120,7 +120,7 @@ class PlausibilityChecks:
         return DeviceEvent("warning", f"{text}: {remedy}", data)
 
     def _check_time(self, ticks: int, arrival_ns: int) -> list[DeviceEvent]:
-        """Compare device time with the arrivals, once."""
+        """Compare device time with the arrivals; the result is reported only once."""
         if self._first is None:
             self._first = (ticks, arrival_ns)
             return []
@@ -142,7 +142,7 @@ class PlausibilityChecks:
     def _check_rates(
         self, check: RateUnitCheck, arrival_ns: int, si: tuple[float, ...], ticks: int | None
     ) -> list[DeviceEvent]:
-        """Compare the rates with the motion of gravity."""
+        """Compare the angular rates with the motion of gravity in sensor axes."""
         timed = ticks is not None and self._form.tick_clock is not None
         t_ns = round((ticks or 0) * duration_ns(self._form.tick_clock)) if timed else arrival_ns
         rate = cast("Vector", si[self._places["rate"]])

@@ -1,13 +1,13 @@
 r"""Check of the unit of angular rates by the motion of gravity in sensor axes.
 
-The direction a of the specific force, constant in the world, changes in sensor axes by
+The direction a of the specific force is constant in the world. In sensor axes it changes by
 
 .. math:: \Delta a = -k \, (\omega \times a) \, \Delta t ,
 
-with k = 1 if the rate is in rad/s. k is the slope of a regression over the first rotations. Linear
-acceleration scatters the differences, and does not bias the slope.
+with k = 1 if the rate is in rad/s. The factor k is the slope of a regression over the first
+rotations. Linear acceleration adds noise to the differences, but does not bias the slope.
 
-Invariant: the result depends only on the readings fed; the check reads no clock.
+Invariant: the result depends only on the readings fed. The check reads no clock.
 """
 
 from __future__ import annotations
@@ -21,33 +21,33 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Vector
 
 _STEPS = 300
-"""Steps after which the slope is evaluated for the first time."""
+"""Number of steps after which the slope is computed for the first time."""
 _MOST_STEPS = 6000
-"""Steps after which a sensor that hardly rotated is no longer checked."""
+"""Number of steps after which the check ends if the sensor hardly rotated."""
 _EXPLAINED = 0.5
 """Smallest share of the squared differences that the regression must explain."""
 _LOW, _HIGH = 0.6, 1.7
-"""Range of k with a correct unit."""
+"""Range of k in which the unit counts as correct."""
 _FREE = 0.3
-"""Largest deviation of the specific force from gravity, relative."""
+"""Largest relative deviation of the specific force from gravity for a step."""
 _LONGEST_S = 0.1
-"""Longest step, s."""
+"""Longest duration of a step, s."""
 
 
 class RateUnitCheck:
-    """Compares angular rate and specific force of one sensor."""
+    """Compares the angular rate with the specific force of one sensor."""
 
     def __init__(self) -> None:
         self._last: tuple[int, Vector, Vector] | None = None
         self._cross = self._predicted = self._observed = 0.0
         self._steps = 0
         self.slope: float | None = None
-        """k if the check has found that it is certain and out of range; None otherwise."""
+        """k if it is certain that k is out of range; None otherwise."""
         self.done = False
-        """Whether the check ended."""
+        """Whether the check has ended."""
 
     def take(self, t_ns: int, rate: Vector, force: Vector) -> None:
-        """Add a reading: rate in rad/s, specific force in m/s^2."""
+        """Add a reading: rate in rad/s and specific force in m/s^2, both in sensor axes."""
         length = sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
         if abs(length - GRAVITY) > _FREE * GRAVITY:
             self._last = None
@@ -57,7 +57,8 @@ class RateUnitCheck:
         if last is None or not 0 < t_ns - last[0] <= _LONGEST_S * 1e9:
             return
 
-        # Use the mean rate of two readings: a rate may refer to its stamp or to the time before.
+        # The mean rate of two readings is used, because a rate may refer to its stamp or to the
+        # time before.
         step_s = 0.5e-9 * (t_ns - last[0])
         wx, wy, wz = ((now + then) * step_s for now, then in zip(rate, last[1], strict=True))
         bx, by, bz = last[2]
@@ -80,7 +81,7 @@ class RateUnitCheck:
                 self.slope = slope
 
     def fitting_unit(self, configured: float) -> str | None:
-        """Return the unit with which k is about 1; `configured` is the present unit in rad/s."""
+        """Return the unit for which k is near 1; `configured` is the current unit in rad/s."""
         if self.slope is None:
             return None
         for unit, si in UNITS["rate"].items():

@@ -1,7 +1,7 @@
-"""Samples in SI units from the records of a device that a table describes.
+"""Conversion of records to samples in SI units, for a device that a table describes.
 
-Invariant: the output depends only on the records; no clock and no port is read. Every record
-becomes one sample, or is refused with a reason.
+Invariant: the output depends only on the records. The module reads no clock and no port. Every
+record becomes one sample, or is rejected with a reason.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ if TYPE_CHECKING:
     from jointfit_protocols.orientation import Quaternion
 
 _COARSE = 1e-4
-"""Value of one count from which on rounding changes the norm of a quaternion noticeably."""
+"""Value of one count from which rounding changes the norm of a quaternion noticeably."""
 _TOLERANCE, _COARSE_TOLERANCE = 0.01, 0.05
 _RECHECK = 100
-"""Refused records after which the settings are checked again; then ten times as many."""
+"""Number of rejected records after which the settings are checked again. It then grows tenfold."""
 
 
 class RecordSamples(Refusals):
-    """Converts the records of one device.
+    """Converts the records of one device to samples.
 
     Parameters
     ----------
     form : SampleForm
-        Meaning of the numbers.
+        Meaning of the numbers in the records.
     """
 
     def __init__(self, form: SampleForm) -> None:
@@ -115,7 +115,7 @@ class RecordSamples(Refusals):
         return out + self._sample(record, ticks, counter)
 
     def _confirmed(self, held: TableRecord, *, restarted: bool) -> list[Decoded]:
-        """Return the sample of the held record, which the next record confirmed."""
+        """Return the sample of the held record, after the next record confirmed it."""
         ticks = self._ticks(held.values)
         out: list[Decoded] = []
         if restarted:
@@ -130,7 +130,7 @@ class RecordSamples(Refusals):
 
     @override
     def flush(self) -> list[Decoded]:
-        """Refuse a record that waits for the next record."""
+        """Reject a record that waits for the next record."""
         held, self._held = self._held, None
         if held is None:
             return []
@@ -172,8 +172,8 @@ class RecordSamples(Refusals):
     def _oriented(
         self, raw: RawSamples, record: TableRecord, si: tuple[float, ...], stamp: RawStamp
     ) -> list[Decoded]:
-        """Return the samples whose orientation the gateway computes."""
-        # Without device time, the stamps of the kernel are its time.
+        """Return samples for which the gateway computes the orientation."""
+        # Without device time, the filter uses the kernel's stamps.
         clock = self.tick_clock
         if clock is None:
             now, passed_ns = record.arrival_ns, float(record.arrival_ns - self._raw_at)
@@ -203,13 +203,13 @@ class RecordSamples(Refusals):
         return None if make_raw is None else make_raw()
 
     def _si(self, values: Sequence[float | None]) -> tuple[float, ...]:
-        """Return the measured components in SI units."""
-        # measured components are never None; the shorter one ends the product
+        """Return the measured components of a record in SI units."""
+        # Measured components are never None. The shorter sequence ends the product.
         si: Iterator[float] = map(mul, cast("Sequence[float]", values), self._scales)
         return tuple(si) if self._zeros is None else tuple(map(add, si, self._zeros))
 
     def _ticks(self, values: Sequence[float | None]) -> int | None:
-        """Return device time in ticks."""
+        """Return the device time of a record in ticks; None if it is unknown."""
         raw = None if self._time is None else values[self._time]
         if raw is None or self.tick_clock is None:
             return None
@@ -228,7 +228,7 @@ class RecordSamples(Refusals):
             return None
 
     def _is_valid(self, raw: float | None) -> bool:
-        """Return whether the device reports a valid sample; a missing report is no objection."""
+        """Return whether the device marked the sample as valid; a missing mark counts as valid."""
         try:
             bits = 1 if raw is None else int(raw) & self._form.mask
         except (ValueError, OverflowError):

@@ -1,4 +1,4 @@
-"""Records of a device that a table describes, and the meaning of their numbers."""
+"""Records of a device that a table describes, and the meaning of the numbers in them."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from jointfit_protocols.table import TableField  # noqa: TC001 - mypyc evaluates
 
 
 class SampleForm(NamedTuple):
-    """Meaning of the numbers of a record."""
+    """Meaning of the numbers in a record."""
 
     slots: tuple[int, ...]
-    """Slots of the record, in its order."""
+    """Slots of the record in the order of its numbers."""
     scales: tuple[float, ...]
-    """SI value of one count of each measured component."""
+    """SI value of one count, for each measured component."""
     zeros: tuple[float, ...]
-    """SI value of the count 0 of each measured component."""
+    """SI value of the count 0, for each measured component."""
     rate_hz: float
     tick_clock: TickClock | None = None
-    """Unit and modulus of device time; None without device time."""
+    """Unit and modulus of device time; None if the device sends no time."""
     ticks_per_count: float | None = None
-    """Ticks per unit of a time that is no integer; None if the integer counts ticks."""
+    """Number of ticks per unit of a time that is not an integer; None if the time is in ticks."""
     counts: int | None = None
-    """Values of the counter; None: it never wraps."""
+    """Number of values of the counter; None if it never wraps."""
     mask: int = -1
-    """Bits of the number of validity that are evaluated."""
+    """Mask of the bits in the validity number that are evaluated."""
     equals: int | None = None
-    """Value of these bits in a valid sample; None: any but 0."""
+    """Value of these bits in a valid sample; None if any value except 0 is valid."""
     world: World = "ENU"
     world_to_sensor: bool = False
     fields: Mapping[int, TableField] | None = None
-    """Place of each slot, to find settings that fit; None for text lines."""
+    """Position of each slot, for the search for settings that fit; None for text lines."""
     rate_unit: float = 1.0
     """SI value of the configured unit of angular rates."""
     make_raw: Callable[[], RawSamples] | None = None
@@ -45,19 +45,19 @@ class SampleForm(NamedTuple):
 
 
 class TableRecord(NamedTuple):
-    """One record with its arrival."""
+    """One record and its arrival."""
 
     arrival_ns: int
     values: tuple[float | None, ...]
-    """Numbers as sent, in the order of the slots; None if a frame is missing."""
+    """Numbers as sent, in the order of the slots; None if their frame is missing."""
     size: int
-    """Length of the record on the wire, or in the chunks of a CAN bus, bytes."""
+    """Length of the record, bytes: on the wire, or in the chunks of a CAN bus."""
     data: tuple[bytes, ...]
-    """Data of its frames."""
+    """Bytes of the frames of the record."""
 
 
 def duration_ns(clock: TickClock | None) -> float:
-    """Return the duration of a tick, ns; 1 without device time."""
+    """Return the duration of a tick, ns; 1 if there is no device time."""
     if clock is None:
         return 1.0
     return 1e9 / clock.ticks_per_s if clock.ticks_per_s else float(clock.tick_ns)

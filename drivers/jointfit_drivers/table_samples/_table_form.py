@@ -1,6 +1,6 @@
-"""From the keys of ``fields`` to places in frames and to the meaning of a record.
+"""Conversion of the keys of ``fields`` to positions in frames and to the meaning of a record.
 
-Invariant: every fault is returned with its key and remedy; nothing is opened.
+Invariant: every fault is returned with its key and remedy, and no device is opened.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ if TYPE_CHECKING:
 
 _US = 1e-6
 _WRAPS = 1 << 32
-"""Values of micros() and millis() of Arduino."""
+"""Number of values of the Arduino functions micros() and millis()."""
 _WRAPPING = ("us", "ms")
 _ALL_BITS = 64
 
 Faults = list[tuple[str, str]]
-"""Keys with their faults."""
+"""Keys, each with its fault and remedy."""
 
 
 class FieldFaultError(Exception):
-    """A part of a quantity cannot be placed.
+    """The position of a field cannot be determined.
 
     Parameters
     ----------
     name : str
-        Key inside the part, such as ``offset``.
+        Key inside the field, such as ``offset``.
     text : str
-        Fault and remedy.
+        Description of the fault and its remedy.
     """
 
     def __init__(self, name: str, text: str) -> None:
@@ -57,17 +57,17 @@ class FieldFaultError(Exception):
 
 @dataclass
 class TableForm:
-    """Places of all numbers of a table, and its faults."""
+    """Positions of all numbers of a table, and the faults of the table."""
 
     fields: dict[int, TableField] = field(default_factory=dict)
-    """Place of each slot; their scales lead to SI units."""
+    """Position of each slot. The scale of a position converts to SI units."""
     parts: dict[int, FieldSettings] = field(default_factory=dict)
-    """Keys of each slot."""
+    """Keys of the field that contains each slot."""
     faults: Faults = field(default_factory=list)
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
-        """Quantities with a place."""
+        """Quantities whose position is known."""
         return slot_quantities(self.fields)
 
 
@@ -75,15 +75,15 @@ def place_fields(
     quantities: Mapping[Quantity, Sequence[FieldSettings]],
     place: Callable[[Quantity, FieldSettings, int], list[TableField]],
 ) -> TableForm:
-    """Return the place of every slot.
+    """Return the positions of all slots.
 
     Parameters
     ----------
     quantities
-        Parts of each quantity.
+        Fields of each quantity.
     place
-        Returns the places of a given number of components of a part, unscaled or with the scale of
-        its file; raises `FieldFaultError`.
+        Function that returns the positions of a given number of components of a field, without a
+        scale or with the scale of a DBC file. It raises `FieldFaultError`.
     """
     form = TableForm()
     for name, parts in quantities.items():
@@ -117,12 +117,12 @@ def place_fields(
 def binary_place(
     part: FieldSettings, count: int, byte_order: ByteOrder, frame: int = 0
 ) -> list[TableField]:
-    """Return the places of `count` components of a part at an offset.
+    """Return the positions of `count` components of a field at its offset.
 
     Raises
     ------
     FieldFaultError
-        Offset or type is missing or wrong.
+        Offset or type of the field is missing or wrong.
     """
     if part.offset is None:
         raise FieldFaultError("offset", "missing: expected its first byte in the frame, from 0")
@@ -150,16 +150,16 @@ def binary_place(
 def overlap_faults(
     form: TableForm, others: Mapping[str, TableField], sizes: Mapping[int, int]
 ) -> Faults:
-    """Return fields that share bytes with each other or `others`, or lie beyond their frame.
+    """Return faults of fields that overlap each other or `others`, or exceed their frame.
 
     Parameters
     ----------
     form
-        Places of the table.
+        Positions of the fields in the table.
     others
-        Parts of the frames that are no fields, by key.
+        Parts of the frames that are not fields, by key.
     sizes
-        Bytes for fields in each frame, if known.
+        Number of bytes for fields in each frame, if known.
     """
     named = {f"fields.{_quantity(slot)} {slot}": each for slot, each in form.fields.items()}
     named |= {f"{key} ": each for key, each in others.items()}
@@ -186,7 +186,7 @@ def overlap_faults(
 
 
 def sample_form(form: TableForm, settings: TableImuSettings, *, is_text: bool) -> SampleForm:
-    """Return the meaning of the records."""
+    """Return the meaning of the numbers in a record."""
     slots = tuple(sorted(form.fields))
     measured = [form.fields[slot] for slot in slots if slot < MEASURED]
     clock, per_count = _clock(form, is_text=is_text)
@@ -218,12 +218,12 @@ def sample_form(form: TableForm, settings: TableImuSettings, *, is_text: bool) -
 
 
 def orientation_faults(form: TableForm, settings: TableImuSettings, *, timed: bool) -> Faults:
-    """Return quantities that are missing for the chosen computation of the orientation.
+    """Return faults for quantities that the selected computation of the orientation requires.
 
     Parameters
     ----------
     form
-        Places of the table.
+        Positions of the fields in the table.
     settings
         Other keys of the table.
     timed
@@ -253,7 +253,7 @@ _WHY = {
 
 
 def _clock(form: TableForm, *, is_text: bool) -> tuple[TickClock | None, float | None]:
-    """Return the time base of the device, and the ticks per unit of a time that is no integer."""
+    """Return the time base, and the ticks per unit of a time that is not an integer."""
     (slot,) = SLOTS["time"]
     if slot not in form.fields:
         return None, None
@@ -265,7 +265,8 @@ def _clock(form: TableForm, *, is_text: bool) -> tuple[TickClock | None, float |
         return TickClock(1000, wrap), per_count
 
     modulus = part.modulus or (None if place.bits == _ALL_BITS else place.modulus)
-    # Either a whole number of ns, or one of ticks per second: whichever is nearer.
+    # The tick is an integer number of ns, or an integer number of ticks per second, whichever is
+    # nearer.
     tick_ns = abs(place.scale) * 1e9
     whole, rate = round(tick_ns), round(1e9 / tick_ns)
     if rate == 0 or (whole and abs(whole / tick_ns - 1) <= abs(rate * tick_ns * 1e-9 - 1)):
@@ -274,7 +275,7 @@ def _clock(form: TableForm, *, is_text: bool) -> tuple[TickClock | None, float |
 
 
 def _order(name: Quantity, part: FieldSettings, letters: str) -> str:
-    """Return the components of a part."""
+    """Return the components that a field contains, as letters in the order of sending."""
     if part.order is None:
         return letters
     if name not in COMPONENTS:
@@ -286,7 +287,7 @@ def _order(name: Quantity, part: FieldSettings, letters: str) -> str:
 
 
 def _scaled(name: Quantity, part: FieldSettings, place: TableField) -> TableField:
-    """Return the place with the scale to SI units."""
+    """Return the position with a scale that converts to SI units."""
     if part.scale is not None and part.divisor is not None:
         raise FieldFaultError("divisor", "expected either `scale` or `divisor`")
     owners: dict[Literal["modulus", "mask", "equals"], tuple[Quantity, ...]] = {

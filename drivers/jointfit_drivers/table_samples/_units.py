@@ -1,4 +1,4 @@
-"""Units of the quantities of a table."""
+"""Units that a table permits for its quantities."""
 
 from __future__ import annotations
 
@@ -12,5 +12,5 @@ UNITS: dict[str, dict[str, float]] = {
     "acceleration": {"m/s2": 1.0, "g": GRAVITY, "mg": GRAVITY / 1000},
     "time": {"s": 1.0, "ms": 1e-3, "100us": 1e-4, "us": 1e-6, "ns": 1e-9},
 }
-"""SI value of each unit by quantity, the default first; quaternions and magnetic fields have none,
-and time has no default."""
+"""SI value of each unit, by quantity. The first unit is the default. Quaternions and magnetic
+fields have no unit, and time has no default."""

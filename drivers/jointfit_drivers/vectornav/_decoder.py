@@ -1,6 +1,6 @@
-"""Decoder of the VectorNav driver: chunks in, samples in SI units with canonical orientation out.
+"""Decoder of VectorNav devices: converts chunks to samples in SI units with canonical orientation.
 
-Invariant: the output depends only on the chunks fed; the decoder reads no clock and no port.
+Invariant: the output depends only on the chunks fed. The decoder reads no clock and no port.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ _FIELDS = (int(Field.IMU_MAGNETIC_FIELD), int(Field.MAGNETIC_AND_PRESSURE))
 _NAMES = {Register.MODEL: "model", Register.SERIAL: "serial", Register.FIRMWARE: "firmware"}
 _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _SMALL = 1e-4
-"""Largest difference of an element from the identity matrix in a rotation that counts as none."""
+"""Largest difference between a rotation matrix and the identity that counts as no rotation."""
 _NEWEST = NewestKnown((3,), "VectorNav Control Center")
-"""Firmware of the VN-100 in 2024; the numbers of other models are lower."""
+"""Newest supported firmware: that of the VN-100 in 2024. Versions of other models are lower."""
 
 
 class _Places:
-    """Places of the decoded fields in one kind of output; None for those that it does not have."""
+    """Positions of the decoded fields in one type of output; None for missing fields."""
 
     __slots__ = ("field", "force", "quaternion", "rate", "time")
 
@@ -71,11 +71,12 @@ class VectorNavDecoder(SerialMessageDecoder[VectorNavMessage]):
     baud : int, optional
         Line speed, bit/s, for back-dating of stamps; None for USB.
     world_to_sensor : bool
-        Whether the quaternion maps world to sensor coordinates.
+        Whether the quaternion converts world to sensor coordinates.
     make_raw : callable, optional
-        Returns a new filter of raw measurements; None if the device sends orientations.
+        Function that returns a new filter of raw measurements; None if the device sends
+        orientations.
     rate_hz : float, optional
-        Configured rate, Hz; None without a check.
+        Configured rate, Hz; None to skip the check of the rate.
     output : int
         Number of the binary output that the driver configures.
     """
@@ -123,7 +124,7 @@ class VectorNavDecoder(SerialMessageDecoder[VectorNavMessage]):
         return out
 
     def _decode_output(self, packet: BinaryPacket) -> list[Decoded]:
-        """Return the content of a binary output; nothing for one without the needed fields."""
+        """Return the content of a binary output; nothing if required fields are missing."""
         header = packet.layout.header
         places = self._places.get(header)
         if places is None:
@@ -159,7 +160,7 @@ class VectorNavDecoder(SerialMessageDecoder[VectorNavMessage]):
 
 
 _MOST_KINDS = 16
-"""Kinds of outputs whose places are stored."""
+"""Largest number of output types whose positions are stored."""
 
 
 def _vector(values: tuple[Any, ...]) -> Vector:

@@ -1,7 +1,7 @@
 """Driver of VectorNav IMUs on a serial port or USB.
 
 `VectorNavDecoder` is the pure part. `VectorNavImu.run` opens the port, makes the device stream and
-reads until cancelled. `run` passes nothing but chunks to the decoder.
+reads until cancelled. The decoder receives only the chunks that `run` emits.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class VectorNavImu:
-    """One VectorNav device: orientation and device time, ns."""
+    """One VectorNav device, which sends orientation and device time in ns."""
 
     Settings: ClassVar[type[VectorNavSettings]] = VectorNavSettings
     wire: ClassVar[Wire] = "stream"
@@ -49,8 +49,8 @@ class VectorNavImu:
         DeviceLostError
             The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            The file is not a serial port, the device uses another speed, no VectorNav device
-            answers, or it cannot send the orientation at this rate.
+            The file is not a serial port, or no VectorNav device answers. Or the device uses
+            another speed, or cannot send the orientation at this rate.
         """
         settings = self._settings
         await self._reception.run(

@@ -1,9 +1,9 @@
-"""From an open port to a streaming VectorNav device, or to the error that explains the failure.
+"""Start of a VectorNav device: makes it stream, or raises an error that explains the failure.
 
-Registers are read and compared, and written only where they differ. Written values are volatile:
-without ``persist`` the device returns to its stored values at the next power-up. A fault that may
-clear by itself raises `DeviceLostError`, any other `DeviceMisconfiguredError`; the device then
-streams as before.
+The driver reads registers, and writes only registers that differ. Written values are volatile:
+without ``persist``, the device returns to its stored values at the next power-up. A fault that may
+end without a change of the settings raises `DeviceLostError`. All other faults raise
+`DeviceMisconfiguredError`, and the device streams as before.
 """
 
 from __future__ import annotations
@@ -37,26 +37,26 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LINE_SPEEDS = (115_200, 921_600, 460_800, 230_400, 128_000, 57_600, 38_400, 19_200, 9_600)
-"""Line speeds to search, bit/s: factory setting and common choices first."""
+"""Line speeds for the search, bit/s: factory setting and usual speeds first."""
 _REPLY_S, _STORE_S = 0.5, 3.0
-"""Longest wait for a reply, and for all registers to be stored, s."""
+"""Longest wait for a reply, and until all registers are stored, s."""
 _IMU_RATES = {"VN-3": 400}
 _IMU_RATE = 800
-"""Rate of the IMU, Hz, by the beginning of the model name, and of all other models."""
+"""Rate of the IMU, Hz: by the beginning of the model name, and for all other models."""
 
 
 class VectorNavHandshake:
-    """Brings one device into streaming.
+    """Makes one device stream.
 
     Parameters
     ----------
     port, emit : SerialPort, Emit
-        Open port, and the receiver of the device's bytes.
+        Open port, and function that receives the device's bytes.
     settings : VectorNavSettings
         Table of the device in rig.toml.
     hunt : bool
-        Whether to search for a silent device at other speeds. A device whose bytes cannot be
-        decoded is always searched for.
+        Whether to search for a silent device at other speeds. If the device's bytes cannot be
+        decoded, the other speeds are always searched.
     """
 
     def __init__(
@@ -70,14 +70,14 @@ class VectorNavHandshake:
         self._model = "the device"
 
     async def ensure_streaming(self) -> None:
-        """Return when the device streams according to the settings.
+        """Return when the device streams with the configured settings.
 
         Raises
         ------
         DeviceLostError
-            The device is silent, unplugged, or stopped answering.
+            The device does not answer, was unplugged, or stopped answering.
         DeviceMisconfiguredError
-            The device uses another speed, is of another kind, or it cannot send the orientation at
+            The device uses another speed, is of another kind, or cannot send the orientation at
             this rate.
         """
         settings = self._settings
@@ -104,7 +104,7 @@ class VectorNavHandshake:
         self._refuse(await self._answer("VNASY,1"), "refuses to stream")
 
     async def _configure(self) -> None:
-        """Write the registers that differ, while the device is paused."""
+        """Write the registers that differ; the device must be paused."""
         model = await self._answer(f"VNRRG,{Register.MODEL}")
         if model.error is None and len(model.values) > 1:
             self._model = model.values[1]
@@ -121,7 +121,7 @@ class VectorNavHandshake:
             )
 
     async def _ensure_output(self) -> bool:
-        """Make the device send the required fields; return whether it was written."""
+        """Make the device send the required fields; return whether the register was written."""
         register = Register.BINARY_OUTPUT + self._settings.output - 1
         wanted = BinaryOutput(BOTH_PORTS, self._divisor(), self._settings.required)
         found = await self._read_output(register)
@@ -151,7 +151,7 @@ class VectorNavHandshake:
         return decode_output(reply.values[1:])
 
     async def _ensure_no_text(self) -> bool:
-        """Switch the ASCII output off, which takes time on the line; return whether it was on."""
+        """Switch off the ASCII output, which takes time on the line; return whether it was on."""
         reply = await self._answer(f"VNRRG,{Register.TEXT_OUTPUT}")
         if reply.error is not None or reply.values[1:2] == ("0",):
             return False
@@ -161,14 +161,14 @@ class VectorNavHandshake:
         return True
 
     def _divisor(self) -> int:
-        """Return the divisor of the requested rate."""
+        """Return the divisor for the requested rate."""
         imu_hz = next((hz for name, hz in _IMU_RATES.items() if name in self._model), _IMU_RATE)
         return self._settings.rate_divisor(imu_hz, self._model)
 
     async def _ask(
         self, request: str, *, tries: int, wait_s: float = _REPLY_S
     ) -> TextMessage | None:
-        """Return the reply to a request, or the error instead; None without either."""
+        """Return the reply to a request, or the device's error message; None if neither arrives."""
         command, _, rest = request.partition(",")
         register = int(rest.split(",")[0]) if command in {"VNRRG", "VNWRG"} else None
 
@@ -184,7 +184,7 @@ class VectorNavHandshake:
         return found if isinstance(found, TextMessage) else None
 
     async def _answer(self, request: str, *, wait_s: float = _REPLY_S) -> TextMessage:
-        """Return the reply to a request that the device must answer; it may be an error."""
+        """Return the reply to a request that the device must answer; the reply may be an error."""
         reply = await self._ask(request, tries=3, wait_s=wait_s)
         if reply is None:
             raise self._settings.stopped_answering()
@@ -199,7 +199,7 @@ class VectorNavHandshake:
 
 
 def _is_sufficient(found: BinaryOutput | None, wanted: BinaryOutput) -> bool:
-    """Return whether an output is on both ports, at the rate, and has the required fields."""
+    """Return whether an output is sent on both ports, at the rate, with the required fields."""
     if found is None or found[:2] != wanted[:2]:
         return False
     return set(wanted.fields) <= set(found.fields)

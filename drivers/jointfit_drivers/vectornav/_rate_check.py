@@ -1,8 +1,8 @@
-"""Comparison of the rate of a stream with the configured one. Pure.
+"""Comparison of the rate of a stream with the configured rate; pure.
 
-The driver derives the divisor of its output from a nominal rate of the IMU, 400 or 800 Hz by model.
-If the IMU of a device was set to another rate, the stream has another rate, too, and the device
-reports no error.
+The driver computes the divisor of its output from a nominal rate of the IMU, which is 400 or 800 Hz
+depending on the model. If the IMU of a device has a different rate, the rate of the stream is
+wrong, and the device reports no error.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from statistics import median
 from jointfit_daemon.model import DeviceEvent
 
 _INTERVALS = 20
-"""Intervals whose median is the period: lost messages do not change it."""
+"""Number of intervals whose median is the period, so that lost messages do not change it."""
 _WRONG = 0.05
-"""Largest relative deviation from the configured rate."""
+"""Largest relative deviation from the configured rate that causes no warning."""
 
 
 class RateCheck:
-    """Measures the rate once after the divisor of the output was received.
+    """Measures the rate once, after the divisor of the output was received.
 
     Parameters
     ----------
@@ -33,12 +33,12 @@ class RateCheck:
         self._intervals: list[int] = []
 
     def start(self, divisor: int) -> None:
-        """Begin a measurement; `divisor` is the rate divisor of the output."""
+        """Begin a measurement. `divisor` is the rate divisor of the output."""
         self._divisor, self._last = divisor, None
         self._intervals.clear()
 
     def add(self, ticks: int) -> DeviceEvent | None:
-        """Add the time of a message, ns; return a warning if the rate is another."""
+        """Add the time of a message, ns; return a warning if the rate is not the configured one."""
         if not self._divisor:
             return None
         last, self._last = self._last, ticks

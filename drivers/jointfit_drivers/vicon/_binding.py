@@ -1,9 +1,10 @@
-"""Binding of subjects, segments and markers to the names in rig.toml.
+"""Assignment of subjects, segments and markers to the names in rig.toml.
 
-A subject with one segment is a prop: its body has the name of the subject. The segments of other
-subjects are bodies, too: ``Anna/LeftThigh``. Ids count per subject.
+A subject with a single segment is a prop, whose body has the name of the subject. The segments of
+other subjects are bodies with names such as ``Anna/LeftThigh``. Each subject has its own range of
+ids.
 
-Invariant: pure; only names matter, not ids and orders.
+Invariant: the module is pure. Only names matter; ids and orders do not.
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ _MEMBER_BITS = 32
 
 @dataclass(frozen=True, slots=True)
 class ViconBinding:
-    """Columns of the frames, until the subjects change."""
+    """Columns of the frames. They are valid until the subjects change."""
 
     columns: ColumnBinding
     subjects: tuple[SubjectInfo, ...]
     known_markers: frozenset[int]
     parents: dict[int, dict[int, int]]
-    """Parent of each segment, by subject; 0 for a root."""
+    """Parent segment of each segment, by subject; 0 for a root."""
 
 
 def bind_subjects(
@@ -40,9 +41,9 @@ def bind_subjects(
     Parameters
     ----------
     subjects : sequence of SubjectInfo
-        The server's latest subjects.
+        Most recent description of the subjects from the server.
     markers, bodies : mapping of str to str
-        Names in rig.toml, and the key of each.
+        Names in rig.toml, each with its key.
     """
     of_markers = [
         ModelEntry(member_key(subject.subject, marker.id), subject.name, marker.name, number)

@@ -1,9 +1,9 @@
-"""Decoder of the Vicon driver: packets in, optical frames out.
+"""Decoder of Vicon DataStream servers: converts packets to optical frames.
 
-Every chunk is one packet. Device time is the number of the frame according to the cameras, in
-units of the frame period. Arrivals are back-dated by the announced delay.
+Every chunk is one packet. Device time is the number of the camera frame times the frame period. The
+announced delay is subtracted from the arrivals.
 
-Invariant: the output depends only on the chunks fed; the decoder reads no clock and no socket.
+Invariant: the output depends only on the chunks fed. The decoder reads no clock and no socket.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _LONGEST_PERIOD = 10 * vicon.TICKS_PER_S
 """Longest plausible frame period, ticks."""
 _Y_UP = 1
 _LATENCY_AFTER = 100
-"""Frames after which the announced delay is reported."""
+"""Number of frames after which the announced delay is reported."""
 _KNOWN_IDS = vicon.STATIC | vicon.DYNAMIC | frozenset(map(int, ObjectId)) | vicon.REQUESTS
 
 _Found = TypeVar("_Found")
@@ -48,7 +48,7 @@ class ViconDecoder:
     Parameters
     ----------
     settings : ViconSettings
-        Names in rig.toml, and up axis.
+        The ``[mocap]`` table with names and up axis.
     """
 
     def __init__(self, settings: ViconSettings) -> None:
@@ -71,27 +71,27 @@ class ViconDecoder:
         self.discarded_bytes = 0
         """Number of bytes in packets that could not be decoded."""
         self.unknown_ids = 0
-        """Markers and segments dropped because no subject has them."""
+        """Number of markers and segments dropped because they belong to no subject."""
         self.suspicious = 0
-        """Segments rejected because their rotation is not valid."""
+        """Number of segments rejected because of an invalid rotation."""
 
     @property
     def tick_clock(self) -> TickClock | None:
-        """Ticks of 1/135 000 000 s, once the frame period is known."""
+        """Ticks of 1/135 000 000 s; None until the frame period is known."""
         return None if self._period is None else _CLOCK
 
     @property
     def duplicates(self) -> int:
-        """Number of frames dropped because they had the number of the preceding frame."""
+        """Number of frames dropped because they had the number of the previous frame."""
         return self._continuity.duplicates
 
     @property
     def late(self) -> int:
-        """Frames dropped because a later one had arrived."""
+        """Number of frames dropped because a later frame had already arrived."""
         return self._continuity.late
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return the content of one packet; never raises."""
+        """Return the content of one packet; never raise."""
         packet = vicon.decode(chunk.data)
         if isinstance(packet, CorruptBytes):
             self.discarded_bytes += packet.discarded
@@ -120,7 +120,7 @@ class ViconDecoder:
         return out
 
     def flush(self) -> list[Decoded]:
-        """Return an empty list: every chunk is a whole packet."""
+        """Return an empty list, because every chunk is a complete packet."""
         return []
 
     # --- static objects -----------------------------------------------------------------------
@@ -150,7 +150,7 @@ class ViconDecoder:
                 self._report_quality(item, out)
 
     def _bind(self, subjects: tuple[vicon.SubjectInfo, ...], out: list[Decoded]) -> ViconBinding:
-        """Bind the columns to the subjects; append their changes and the warnings about them."""
+        """Assign the columns to the subjects; append changes and warnings."""
         binding = bind_subjects(subjects, self._wanted_markers, self._wanted_bodies)
         before = None if self._binding is None else self._binding.columns
         columns, events = renew_columns(before, binding.columns)
@@ -160,7 +160,7 @@ class ViconDecoder:
         return binding
 
     def _report_quality(self, item: vicon.ObjectQuality, out: list[Decoded]) -> None:
-        """Append a warning when the quality of a subject becomes poor, and its end."""
+        """Append an event when the quality of a subject becomes poor, and when it recovers."""
         poor = not item.quality >= self._least_quality
         if poor == (item.subject in self._poor):
             return

@@ -1,7 +1,7 @@
 """Search for a DataStream server at named hosts, and diagnosis of "connected, but no data".
 
-The protocol has no discovery: hosts are asked by name or address. Search and diagnosis connect as
-the driver does.
+The protocol has no discovery, so only hosts with a known name or address are queried. Search and
+diagnosis connect in the same way as the driver.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ async def find_servers(
 
 
 async def _ask_host(settings: ViconSettings, wait_s: float) -> list[FoundServer]:
-    """Return the server at an address with its names; empty without an answer."""
+    """Return the server at an address with its names; empty if it does not answer."""
     route = await find_route("Vicon", settings)
     reception = await _receive(settings, wait_s)
     if "model" not in reception.facts:
@@ -84,7 +84,7 @@ async def diagnose(settings: ViconSettings, wait_s: float) -> list[Finding]:
 
 
 async def _receive(settings: ViconSettings, limit_s: float) -> Reception:
-    """Receive as the driver does."""
+    """Receive frames in the same way as the driver."""
 
     async def connect(emit: Emit) -> None:
         await ViconSession(settings, await find_route("Vicon", settings), emit).run()

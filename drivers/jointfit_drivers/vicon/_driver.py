@@ -1,4 +1,4 @@
-"""Driver of Vicon Nexus, Tracker, Shogun, Evoke and Blade by the DataStream, over TCP.
+"""Driver of Vicon Nexus, Tracker, Shogun, Evoke and Blade, by the protocol DataStream over TCP.
 
 `ViconDecoder` is the pure part. `ViconMocap.run` connects and emits every packet of the server, so
 that a replay has the same input as the live decoder.
@@ -27,7 +27,7 @@ class ViconMocap:
     """A chunk is one packet of the protocol."""
 
     packet_stream = ViconStream
-    """Splits the bytes of a recorded connection into packets."""
+    """Class that splits the bytes of a recorded connection into packets."""
 
     find_servers = staticmethod(find_servers)
     diagnose = staticmethod(diagnose)
@@ -46,11 +46,11 @@ class ViconMocap:
         Raises
         ------
         DeviceLostError
-            The host is unknown, does not answer, has no listening server, or sends no frame for
-            ``silence_s``. A retry may succeed.
+            The host is unknown, does not answer, or has no listening server. Or it sends no frame
+            for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            The host is no DataStream server, offers no segments and markers, or the network card
-            is unknown.
+            The host is not a DataStream server, offers no segments and markers, or the network card
+            does not exist.
         """
         route = await find_route("Vicon", self._settings)
         await ViconSession(self._settings, route, emit, self._output).run()

@@ -1,9 +1,9 @@
 """Delay from exposure to arrival, as far as the server announces it.
 
-There is no exposure time and no clock of the server. LatencyInfo gives the duration of the stages
-of processing, and a ping bounds the delay of the network.
+The server sends neither the time of exposure nor a clock. LatencyInfo contains the durations of the
+processing stages, and a ping limits the delay of the network.
 
-Invariant: pure.
+Invariant: the module is pure.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 _NS = 10**9
 _LONGEST_S = 1.0
-"""Longest plausible sum of the stages, s, and age of a ping that is used."""
+"""Longest plausible sum of the stages, and largest age of a ping that is used, s."""
 _SUMS = 101
-"""Last frames from which the median of the sums is computed."""
+"""Number of recent frames from which the median of the sums is computed."""
 _PINGS = 20
 _EVERY = 32
-"""Frames between two computations of the median."""
+"""Number of frames between two computations of the median."""
 
 
 class AnnouncedLatency:
@@ -33,16 +33,16 @@ class AnnouncedLatency:
         self._round_trips_ns: deque[int] = deque(maxlen=_PINGS)
         self._frames = 0
         self.delay_ns = 0
-        """Announced delay of processing and network, ns."""
+        """Announced delay of processing, plus the delay of the network, ns."""
 
     @property
     def announced(self) -> bool:
-        """Whether the server announces the duration of its stages."""
+        """Whether the server announces the durations of its stages."""
         return bool(self._sums_ns)
 
     @property
     def uncertainty_ns(self) -> int:
-        """Half the round trip, and the spread of the sums, ns."""
+        """Half of the round-trip time plus the spread of the sums, ns."""
         spread = statistics.pstdev(self._sums_ns) if len(self._sums_ns) > 1 else 0.0
         return round(self._half_trip_ns + spread)
 
@@ -51,7 +51,7 @@ class AnnouncedLatency:
         return statistics.mean(self._round_trips_ns) / 2 if self._round_trips_ns else 0.0
 
     def add_frame(self, latency: LatencyInfo | None) -> None:
-        """Add the stages of one frame."""
+        """Add the durations of the stages for one frame."""
         if latency is not None:
             total = sum(seconds for _, seconds in latency.stages)
             if 0 <= total <= _LONGEST_S:

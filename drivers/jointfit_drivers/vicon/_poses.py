@@ -1,8 +1,8 @@
 """Conversion of the objects of one Vicon frame to columns: SI units, world z up, NaN if missing.
 
-A subject that is not seen has no object. Positions are millimetres, rotations row-major. Without
-global poses the light-weight ones are used: they are relative to the parent, and a segment without
-its parent is absent.
+A subject that is not visible has no object. Positions are in millimetres, and rotation matrices in
+row-major order. If there are no global poses, the light-weight poses are used. They are relative to
+the parent segment, so a segment without a visible parent counts as missing.
 """
 
 from __future__ import annotations
@@ -33,21 +33,21 @@ if TYPE_CHECKING:
 
 _MM = 1e-3
 _WIDEST = 2 * math.pi
-"""Largest plausible component of a rotation vector, rad; NaN compares as larger."""
+"""Largest plausible component of a rotation vector, rad. Comparisons treat NaN as larger."""
 _DEEPEST = 200
-"""Largest number of segments from a root to the last segment; a longer chain is a loop."""
+"""Largest number of segments from a root to an end. A longer chain contains a loop."""
 
 
 class ViconColumns(NamedTuple):
-    """Arrays of one `MocapFrame`, and the data left out of them."""
+    """Arrays of one `MocapFrame`, and the data that they do not contain."""
 
     markers: Array
     body_positions: Array
     body_orientations: Array
     suspicious: int
-    """Segments that have a position, but no valid rotation."""
+    """Number of segments that have a position but no valid rotation."""
     unknown: int
-    """Markers and segments that no subject has."""
+    """Number of markers and segments that belong to no subject."""
 
 
 class ViconPoseConverter:
@@ -56,14 +56,14 @@ class ViconPoseConverter:
     Parameters
     ----------
     up_axis : UpAxis
-        The stream's axis that points up.
+        Axis of the stream that points up.
     """
 
     def __init__(self, up_axis: str) -> None:
         self._place, self._turn = world_rotation(up_axis)
 
     def columns(self, state: SceneState, binding: ViconBinding) -> ViconColumns:
-        """Return the frame in force in the columns of `binding`."""
+        """Return the current frame in the columns of `binding`."""
         unknown = 0
         seen: dict[int, Vector] = {}
         for item in state.dynamic(ObjectId.LABELED_RECONS):
@@ -95,7 +95,7 @@ class ViconPoseConverter:
 
 
 def _global_poses(state: SceneState) -> tuple[dict[int, Pose], int]:
-    """Return the global poses by key, and the number of suspicious ones."""
+    """Return the global poses by key, and the number of rejected poses."""
     poses: dict[int, Pose] = {}
     suspicious = 0
     for item in state.dynamic(ObjectId.GLOBAL_SEGMENTS):
@@ -114,7 +114,7 @@ def _global_poses(state: SceneState) -> tuple[dict[int, Pose], int]:
 def _chained_poses(
     state: SceneState, parents: dict[int, dict[int, int]]
 ) -> tuple[dict[int, Pose], int]:
-    """Return the global poses from local ones, and the number of suspicious ones."""
+    """Return the global poses computed from local poses, and the number of rejected poses."""
     poses: dict[int, Pose] = {}
     suspicious = 0
     for item in state.dynamic(ObjectId.LIGHT_SEGMENTS):
@@ -138,7 +138,7 @@ def _chained_poses(
 
 
 def _chain(number: int, local: dict[int, Pose], parents: dict[int, int]) -> Pose | None:
-    """Return the global pose of a segment; None without all of its parents."""
+    """Return the global pose of a segment; None if one of its parents is missing."""
     pose = local.get(number)
     for _ in range(_DEEPEST):
         number = parents.get(number, 0)

@@ -1,11 +1,11 @@
-"""Objects in force after each packet of a Vicon DataStream.
+"""Current objects of a Vicon DataStream after each packet.
 
-Static and dynamic objects are two sets. A packet without static objects leaves the static set as
-it is. Otherwise the new static set is the objects in the packet, and those types that ``Contents``
-names as unchanged. The same holds for the dynamic set: a type that is neither present nor
-unchanged is not seen.
+Static and dynamic objects form two separate sets. A packet without static objects does not change
+the static set. Otherwise the new static set consists of the objects in the packet, and of the types
+that the object ``Contents`` lists as unchanged. The dynamic set is updated in the same way. A type
+that is neither present nor unchanged is not visible.
 
-Invariant: pure.
+Invariant: the module is pure.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class SceneState:
-    """The static and the dynamic set."""
+    """The current static and dynamic objects."""
 
     def __init__(self) -> None:
         self._static: dict[int, list[Object]] = {}

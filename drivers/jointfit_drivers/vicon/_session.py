@@ -1,10 +1,11 @@
 """One connection to a Vicon DataStream server, from its offer to silence.
 
-1. The server sends the ids that it offers; the driver answers with those that it wants.
-2. RequestFrame; frames follow.
-3. One ping a second: its round trip bounds the delay of the network.
+1. The server sends the ids of the objects that it offers. The driver answers with the ids that it
+   requires.
+2. The driver sends RequestFrame, and frames follow.
+3. The driver sends one ping per second. Its round-trip time limits the delay of the network.
 
-Every packet is emitted, in order of arrival, so that a replay has the same input.
+Every packet is emitted in the order of arrival, so that a replay has the same input.
 """
 
 from __future__ import annotations
@@ -36,11 +37,11 @@ _WANTED = frozenset((
     ObjectId.APPLICATION_INFO, ObjectId.OBJECT_QUALITY, ObjectId.PING,
 ))  # fmt: skip
 _FRAME_MARK = ObjectId.FRAME_INFO.to_bytes(4, "little") + (4).to_bytes(4, "little")
-"""First bytes of a FrameInfo, which every frame contains."""
+"""Beginning of a FrameInfo object, which every frame contains."""
 
 
 class ViconSession:
-    """One connection; after a loss, a new one is made.
+    """One connection. After a loss, the driver creates a new session.
 
     Parameters
     ----------
@@ -49,9 +50,9 @@ class ViconSession:
     route : Route
         Addresses of the server and of this host's network card.
     emit : Emit
-        Receives every packet of the server.
+        Function that receives every packet of the server.
     output : ServerOutput, optional
-        Output of the earlier connections.
+        Output that is shared with the earlier connections.
     """
 
     def __init__(
@@ -62,14 +63,14 @@ class ViconSession:
         self._output = output or ServerOutput()
         self._output.begin(emit)
         self.offered: frozenset[int] | None = None
-        """Ids that the server offers."""
+        """Ids of the objects that the server offers."""
         self._name = f"Vicon server {settings.server}:{settings.command_port}"
         self._link = TcpLink(self._name, f"{START}, and check command_port", self._read)
         self._stream = vicon.ViconStream()
         self._frame_ns = 0
 
     async def run(self) -> None:
-        """Connect and read until cancelled; raises the errors of `ViconMocap.run`."""
+        """Connect and read until cancelled. The errors are those of `ViconMocap.run`."""
         with self._link as link:
             await link.open(self._route, self._settings.command_port)
             offered = await self._wait_for_offer()
@@ -138,7 +139,7 @@ class ViconSession:
 
 
 def wanted_ids(offered: frozenset[int]) -> frozenset[int]:
-    """Return the ids to request: light segments only if there are no global ones."""
+    """Return the ids to request; light segments are requested only without global segments."""
     wanted = _WANTED
     if ObjectId.GLOBAL_SEGMENTS not in offered:
         wanted |= {ObjectId.LIGHT_SEGMENTS}

@@ -9,7 +9,7 @@ from pydantic import Field
 from jointfit_drivers.motion_capture import ServerSettings
 
 PORT = 801
-"""Usual port of the DataStream."""
+"""Default port of the DataStream."""
 
 
 class ViconSettings(ServerSettings):

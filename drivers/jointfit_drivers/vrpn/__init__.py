@@ -1,4 +1,4 @@
-"""Driver for motion capture over VRPN, by TCP and UDP."""
+"""Driver for motion capture by the Virtual-Reality Peripheral Network (VRPN), over TCP and UDP."""
 
 from jointfit_drivers.vrpn._decoder import VrpnDecoder
 from jointfit_drivers.vrpn._driver import VrpnMocap

@@ -1,9 +1,10 @@
-"""Decoder of the VRPN driver: messages in, optical frames out.
+"""Decoder of VRPN servers: converts messages to optical frames.
 
-The poses of one instant form a frame (`FrameAssembler`). A body is known by the name of its tracker
-once it was described or seen; names of rig.toml that are unknown after half a second are reported.
+The poses of one instant form a frame (`FrameAssembler`). The name of a body is the name of its
+tracker. It is known when the server has described the tracker or sent its first report. Names in
+rig.toml that are still unknown after half a second are reported.
 
-Invariant: the output depends only on the chunks fed; the decoder reads no clock and no socket.
+Invariant: the output depends only on the chunks fed. The decoder reads no clock and no socket.
 """
 
 from __future__ import annotations
@@ -37,17 +38,19 @@ if TYPE_CHECKING:
     from jointfit_drivers.vrpn._settings import VrpnSettings
 
 _STEP_US = 100_000
-"""Least difference, µs, of elapsed server and arrival time that is a step of the server's clock."""
+"""Smallest difference between elapsed server time and arrival time that is a step of the server's
+clock, µs."""
 _PACE_US = 250_000
-"""Time at the server's own pace after which the delay of its messages is known, µs."""
+"""Time with messages at the server's own rate after which their delay is known, µs."""
 _LATEST_US = 1_000_000
 """Longest delay of the first messages of a connection, µs."""
 _SETTLED_US = 500_000
-"""Time after the first report from which missing names are reported, µs."""
+"""Time after the first report after which missing names are reported, µs."""
 _FARTHEST_M = 1_000.0
-"""Largest plausible coordinate, m: servers send larger ones for bodies that are not seen."""
+"""Largest plausible coordinate, m. Some servers send larger values for bodies that are not
+visible."""
 _MOST_BODIES = 2000
-"""Bodies of one server; those beyond are dropped, because each costs memory."""
+"""Largest number of bodies per server. Further bodies are dropped, because each takes memory."""
 _NEWEST = NewestKnown((vrpn.MAJOR, vrpn.MINOR), "the camera software", "VRPN")
 _CLOCKS = {"server": TickClock(1000, None), "utc": TickClock(1000, None, None, "unix")}
 
@@ -58,7 +61,7 @@ class VrpnDecoder:
     Parameters
     ----------
     settings : VrpnSettings
-        Names in rig.toml, unit, up axis and clock.
+        The ``[mocap]`` table with names, unit, up axis and clock.
     """
 
     def __init__(self, settings: VrpnSettings) -> None:
@@ -71,7 +74,7 @@ class VrpnDecoder:
         self._scale = 0.001 if settings.unit == "mm" else 1.0
         self._unit_check = UnitCheck(settings.unit)
         self._bodies: dict[tuple[str, int], None] = {}
-        """Bodies that have reported, in order of their first report."""
+        """Bodies that have sent a report, in the order of their first report."""
         self._binding: ColumnBinding | None = None
         self._stale_binding = True
         self._settled = False
@@ -81,13 +84,13 @@ class VrpnDecoder:
         self._delay = BacklogDelay()
         self._named_unknown: set[int] = set()
         self.unknown_ids = 0
-        """Reports dropped because the server has not described their sender."""
+        """Number of reports dropped because the server has not described their sender."""
         self.suspicious = 0
-        """Poses rejected because their numbers are implausible."""
+        """Number of poses rejected because of implausible numbers."""
 
     @property
     def tick_clock(self) -> TickClock:
-        """Wall clock of the server, µs since 1970."""
+        """Clock of the server: UNIX time in µs."""
         return self._clock
 
     @property
@@ -102,16 +105,16 @@ class VrpnDecoder:
 
     @property
     def late_reports(self) -> int:
-        """Reports dropped because their frame had ended, or a later one had arrived."""
+        """Number of reports dropped because their frame had ended or a later one had arrived."""
         return self._assembler.late
 
     @property
     def repeated_reports(self) -> int:
-        """Reports dropped because their body had reported at the same time."""
+        """Number of reports dropped because their body had already reported at the same time."""
         return self._assembler.duplicates
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return the frames that `chunk` completes, and events; never raises."""
+        """Return the frames that `chunk` completes, and events; never raise."""
         out: list[Decoded] = []
         for message in self._codec.feed(chunk.data):
             match message:
@@ -120,7 +123,8 @@ class VrpnDecoder:
                 case CorruptBytes():
                     out.append(Corrupt(message.discarded, message.reason))
                 case vrpn.Cookie():
-                    # another connection: start again with its server
+                    # The recording contains another connection, so the state of the server is
+                    # discarded.
                     version = f"{message.major:02d}.{message.minor:02d}"
                     out.append(DeviceEvent("info", f"VRPN {version}", {"vrpn": version}))
                     if message.major != vrpn.MAJOR:
@@ -138,7 +142,7 @@ class VrpnDecoder:
         return out
 
     def flush(self) -> list[Decoded]:
-        """Return the frame in progress, and discard an incomplete message."""
+        """Return the unfinished frame, and discard an incomplete message."""
         out: list[Decoded] = []
         for frame in self._assembler.flush():
             self._frame(frame, out)
@@ -148,7 +152,7 @@ class VrpnDecoder:
     # --- reports ------------------------------------------------------------------------------
 
     def _report(self, report: vrpn.TrackerPose, arrival_ns: int, out: list[Decoded]) -> None:
-        """Add the pose of one body; append the frames that it completes."""
+        """Add the pose of one body; append the frames that this report completes."""
         name = self._codec.senders.get(report.sender)
         if name is None:
             self.unknown_ids += 1
@@ -169,7 +173,7 @@ class VrpnDecoder:
             self._frame(frame, out)
 
     def _frame(self, frame: ReportedFrame, out: list[Decoded]) -> None:
-        """Append one frame, after the events that it causes."""
+        """Append one frame after the events that it causes."""
         self._check_clock(frame, out)
         if self._first_us is None:
             self._first_us = frame.time_us
@@ -207,14 +211,15 @@ class VrpnDecoder:
         )
 
     def _check_clock(self, frame: ReportedFrame, out: list[Decoded]) -> None:
-        """Report a step of the server's clock, which is not explained by delayed messages."""
+        """Report a step of the server's clock that delayed messages do not explain."""
         last, now_us = self._last, frame.arrival_ns // 1000
         self._last = (frame.time_us, now_us)
         if last is None:
             return
         advance_us, elapsed_us = frame.time_us - last[0], now_us - last[1]
         delay_us = self._delay.limit(_PACE_US, _LATEST_US)
-        # Less advance than elapsed time is a delay in the network, unless time runs backwards.
+        # If less server time than arrival time elapsed, the network has a delay, unless time
+        # decreased.
         if 0 <= advance_us <= elapsed_us + delay_us + _STEP_US:
             self._delay.feed(advance_us, elapsed_us)
             return
@@ -228,12 +233,12 @@ class VrpnDecoder:
     # --- names --------------------------------------------------------------------------------
 
     def _bound(self, out: list[Decoded]) -> ColumnBinding:
-        """Return the columns, renewed after a new name; append the events of changes."""
+        """Return the columns, which change after a new name; append the events of changes."""
         before = self._binding
         if before is not None and not self._stale_binding:
             return before
 
-        # Bodies that have reported, and those of rig.toml that are described.
+        # These are the bodies that have sent reports, and the described bodies that rig.toml names.
         wanted = {**self._wanted_markers, **self._wanted_bodies}
         described = set(self._codec.senders.values())
         keys = dict(self._bodies)
@@ -248,7 +253,7 @@ class VrpnDecoder:
             plain = numbered if number or numbered in wanted else tracker
             entries.append(ModelEntry((tracker, number), "", plain, number + 1))
 
-        # Markers are trackers that rig.toml names as such; all others are bodies.
+        # Trackers that rig.toml lists as markers are markers. All others are bodies.
         markers = [entry for entry in entries if entry.name in self._wanted_markers]
         others = [entry for entry in entries if entry.name not in self._wanted_markers]
         binding = bind_columns(markers, others, self._wanted_markers, self._wanted_bodies)

@@ -1,6 +1,6 @@
 """Driver of motion-capture systems with a VRPN server.
 
-`VrpnDecoder` is the pure part. `VrpnMocap.run` connects and emits whole messages in order of
+`VrpnDecoder` is the pure part. `VrpnMocap.run` connects and emits complete messages in the order of
 arrival, so that a replay has the same input as the live decoder.
 """
 
@@ -19,12 +19,13 @@ if TYPE_CHECKING:
 
 
 class VrpnMocap:
-    """One VRPN server: rigid bodies, stamped by its wall clock when the message was made."""
+    """One VRPN server: rigid bodies, stamped by the server's clock when a message is created."""
 
     Settings: ClassVar[type[VrpnSettings]] = VrpnSettings
     wire: ClassVar[Wire] = "stream"
     least_delay_ms: ClassVar[tuple[float, float]] = (15.0, 10.0)
-    """Delay from exposure to arrival, ms: the stamp is that of the message, not of the exposure."""
+    """Mean and standard deviation of the delay from exposure to arrival, ms. The stamp is the time
+    of the message, not of the exposure."""
 
     find_servers = staticmethod(find_servers)
     diagnose = staticmethod(diagnose)
@@ -43,10 +44,11 @@ class VrpnMocap:
         Raises
         ------
         DeviceLostError
-            The host is unknown, does not answer, has no listening server, closes the connection, or
-            sends no pose for ``silence_s``. A retry may succeed.
+            The host is unknown, does not answer, has no listening server, or closes the connection.
+            Or it sends no pose for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            The host is no VRPN server, its major version differs, or the network card is unknown.
+            The host is not a VRPN server, its major version differs, or the network card does not
+            exist.
         """
         route = await find_route("VRPN", self._settings)
         await VrpnSession(self._settings, route, emit, self._output).run()

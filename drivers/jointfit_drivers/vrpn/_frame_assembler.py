@@ -1,12 +1,13 @@
-"""Frames from the reports of single bodies.
+"""Assembly of frames from the reports of single bodies.
 
-VRPN has no frames: every body has messages of its own, and a body that is not seen has none. The
-reports of one frame have nearly equal times. A frame ends when every awaited body has reported,
-when one reports again, or with a report half a period later. A body is awaited until it has not
-reported for three periods, at least 100 ms; it is absent from every frame without its report.
+VRPN has no frames: every body has its own messages, and a body that is not visible has none. The
+reports of one frame have nearly equal times. A frame ends in three cases: every expected body has
+reported, a body reports again, or a report is half a period later. A body is expected until it has
+not reported for three periods, but for at least 100 ms. It is missing in every frame without its
+report.
 
-Invariant: pure; the result depends only on the reports, not on their arrival. A body is at most
-once in a frame.
+Invariant: the module is pure. The result depends only on the reports, not on their arrival. A frame
+contains each body at most once.
 """
 
 from __future__ import annotations
@@ -17,33 +18,33 @@ from jointfit_drivers.motion_capture import ColumnKey  # noqa: TC001 - mypyc eva
 from jointfit_protocols.vrpn import TrackerPose  # noqa: TC001 - mypyc evaluates fields
 
 _LEAST_AWAITED_US = 100_000
-"""Shortest time for which a silent body is awaited, µs."""
+"""Shortest time for which a body without reports is still expected, µs."""
 _AWAITED_PERIODS = 3
 _SAME_FRAME = 0.5
-"""Largest difference of the times in one frame, periods."""
+"""Largest difference between the times in one frame, periods."""
 _FIRST_SPREAD_US = 2_000.0
-"""Largest difference of the times in one frame before the period is known, µs."""
+"""Largest difference between the times in one frame while the period is unknown, µs."""
 _LONGEST_US = 500_000
-"""Longest time between two reports of one body that is a period, µs."""
+"""Longest time between two reports of one body that counts as a period, µs."""
 _REORDERED_US = 100_000
-"""Time by which a report may be older than the last one of its body if datagrams were reordered;
-older ones show a step of the clock."""
+"""Largest time by which a report may be older than the body's last report because of reordered
+datagrams, µs. An older report shows a step of the clock."""
 _GAIN = 0.1
-"""Gain of the mean time between two reports of a body."""
+"""Weight of a new interval in the mean time between two reports of a body."""
 
 
 class ReportedFrame(NamedTuple):
-    """Reports of one frame."""
+    """All reports of one frame."""
 
     time_us: int
-    """Time of the first report, wall clock of the server."""
+    """Time of the first report on the server's clock, µs."""
     arrival_ns: int
-    """Arrival of the first report."""
+    """Arrival of the first report, ns."""
     reports: dict[ColumnKey, TrackerPose]
 
 
 class FrameAssembler:
-    """Groups the reports of one server."""
+    """Groups the reports of one server into frames."""
 
     def __init__(self) -> None:
         self._reports: dict[ColumnKey, TrackerPose] = {}
@@ -54,12 +55,13 @@ class FrameAssembler:
         self._last_us: dict[ColumnKey, int] = {}
         self._awaited: set[ColumnKey] = set()
         self.late = 0
-        """Reports dropped because a later one of the body had arrived, or their frame had ended."""
+        """Number of reports dropped because a later report of the body had arrived, or their frame
+        had ended."""
         self.duplicates = 0
-        """Reports dropped because the body had reported at the same time."""
+        """Number of reports dropped because the body had already reported at the same time."""
 
     def forget(self) -> None:
-        """Start again: another server, or another connection."""
+        """Discard the state, because the server or the connection has changed."""
         self._reports = {}
         self._closed = self._period_us = None
         self._mean_us.clear()
@@ -67,12 +69,12 @@ class FrameAssembler:
         self._awaited.clear()
 
     def feed(self, key: ColumnKey, report: TrackerPose, arrival_ns: int) -> list[ReportedFrame]:
-        """Return the frames that a report completes: at most two.
+        """Return the frames that a report completes, at most two.
 
         Parameters
         ----------
         key : ColumnKey
-            The body.
+            Key of the body.
         report : TrackerPose
             Report of the body.
         arrival_ns : int
@@ -91,7 +93,7 @@ class FrameAssembler:
         if self._reports and (key in self._reports or distance_us > spread_us):
             out.append(self._close())
         if not self._reports:
-            # Its frame may have ended without it, because it was not awaited.
+            # The frame of this report may have ended earlier, because the body was not expected.
             closed = self._closed
             if (
                 closed is not None
@@ -111,14 +113,15 @@ class FrameAssembler:
         return out
 
     def flush(self) -> list[ReportedFrame]:
-        """Return the frame in progress."""
+        """Return the unfinished frame; empty if there is none."""
         return [self._close()] if self._reports else []
 
     def _note(self, key: ColumnKey, time_us: int) -> None:
-        """Measure the period, and await this body in the next frames."""
+        """Measure the period, and expect this body in the next frames."""
         step_us = time_us - self._last_us.get(key, time_us)
         if 0 < step_us <= _LONGEST_US:
-            # A mean, because steps between delayed frames are too long and too short in turn.
+            # A mean is used, because the steps between delayed frames are alternately too long and
+            # too short.
             mean_us = self._mean_us.setdefault(key, float(step_us))
             self._mean_us[key] = mean_us + _GAIN * (step_us - mean_us)
             if self._period_us is None:
@@ -127,10 +130,10 @@ class FrameAssembler:
         self._awaited.add(key)
 
     def _close(self) -> ReportedFrame:
-        """Return the frame in progress, and drop bodies that are silent for too long."""
+        """Return the unfinished frame, and remove bodies without reports for too long."""
         frame = ReportedFrame(self._time_us, self._arrival_ns, self._reports)
         self._closed, self._reports = frame, {}
-        # A body that is always seen has the shortest mean.
+        # The body with the shortest mean interval is the one that is always visible.
         known = [mean for key, mean in self._mean_us.items() if key in self._awaited]
         self._period_us = min(known, default=self._period_us)
         missing = self._awaited - frame.reports.keys()

@@ -1,7 +1,8 @@
-"""Sockets to one VRPN server in the event loop.
+"""Sockets to one VRPN server, which are read in the event loop.
 
-The chunks passed on contain whole messages only, so that messages of both sockets form one valid
-stream. Failures of the network are raised as `DeviceLostError`, other exceptions unchanged.
+The emitted chunks contain only complete messages, so that the messages of both sockets form one
+valid stream. Network failures are raised as `DeviceLostError`. Other exceptions are raised
+unchanged.
 """
 
 from __future__ import annotations
@@ -24,18 +25,18 @@ if TYPE_CHECKING:
 
 
 class VrpnLink(SocketLink):
-    """TCP connection, and a UDP socket for poses if they are requested by UDP.
+    """TCP connection, and a UDP socket if poses are requested by UDP.
 
     Parameters
     ----------
     name : str
-        Server, for messages.
+        Name of the server, for messages.
     connection : TcpConnection
-        Connection to the server; closed at the end.
+        Connection to the server, which is closed at the end.
     types : mapping of str to int
-        Numbers of the message types of this side.
+        Numbers that this host uses for the message types.
     take : callable
-        Called with every chunk from the server, in order of arrival.
+        Function that is called with every chunk from the server, in the order of arrival.
     """
 
     def __init__(
@@ -53,11 +54,11 @@ class VrpnLink(SocketLink):
         self._pending = b""
         self._sequence = 0
         self.foreign = 0
-        """Datagrams that were dropped because they are no messages of the server."""
+        """Number of datagrams dropped because they contain no message of the server."""
         self.watch(connection, self._read_tcp)
 
     def open_udp(self, route: Route) -> int:
-        """Open a UDP socket for datagrams of the server and return its port."""
+        """Open a UDP socket for datagrams from the server, and return its port."""
         udp = UdpSocket(route.local, 0, sender=route.host)
         self.watch(udp, partial(self._read_udp, udp, route.host))
         return udp.port

@@ -1,7 +1,7 @@
 """Search for VRPN servers, and diagnosis of missing poses.
 
-VRPN has no discovery: only hosts that are named are asked. The diagnosis connects as the driver
-does.
+VRPN has no discovery, so only hosts with a known name are queried. The diagnosis connects in the
+same way as the driver.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _REMEDY = "enable VRPN streaming and rigid bodies in the camera software"
 
 
 def _reception(settings: VrpnSettings, silence_s: float) -> Reception:
-    """Return the reception of a server, as the driver connects to it."""
+    """Return a reception that connects to the server in the same way as the driver."""
     patient = settings.model_copy(update={"silence_s": silence_s})
 
     async def connect(emit: Emit) -> None:
@@ -58,7 +58,7 @@ async def find_servers(
 
 
 async def _ask(address: str, port: int, wait_s: float) -> FoundServer | None:
-    """Return the server at an address with the bodies that it reports; None without an answer."""
+    """Return the server at an address with the bodies that it reports; None without answer."""
     settings = VrpnSettings(driver="vrpn", server=address, port=port)
     reception = _reception(settings, wait_s)
     await reception.receive(wait_s)
@@ -85,7 +85,7 @@ async def diagnose(settings: VrpnSettings, wait_s: float) -> list[Finding]:
     if not reception.frames:
         text = str(reception.failure or f"no pose within {wait_s:g} s")
         return [Finding(CHECK, name, "error", text, _REMEDY)]
-    # The first frames lack the bodies that reported later.
+    # The last frame is used, because the first frames lack bodies that reported later.
     layout = reception.frames[-1].layout
     reception.frames = [frame for frame in reception.frames if frame.layout == layout]
     return content_findings(settings, reception, name, _REMEDY)

@@ -1,13 +1,13 @@
 """One connection to a VRPN server, from the cookie to silence.
 
-1. A TCP connection to the server; or, in the classic form, an announcement by UDP every 2 s until
-   the server connects back.
-2. Cookies in both directions; other major versions are refused.
-3. With ``transport = "udp"``, the UDP port for poses.
-4. Poses. Before the server counts as silent, it is asked for an answer once a second, so that the
-   report names the cause: no server, or no visible body.
+1. The session opens a TCP connection to the server. In the classic form, it announces itself by UDP
+   every 2 s until the server connects back.
+2. Both sides send a cookie that contains their version. Other major versions are refused.
+3. With ``transport = "udp"``, the session sends the UDP port for poses.
+4. Poses follow. Before the server counts as silent, the session requests an answer once per second.
+   The report can then name the cause: no server, or no visible body.
 
-Invariant: every chunk is emitted in order of arrival, so that a replay has the same input.
+Invariant: every chunk is emitted in the order of arrival, so that a replay has the same input.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ if TYPE_CHECKING:
 CONNECT_S = 3.0
 """Longest wait for the connection, and for the cookie, s."""
 ANNOUNCE_S, ANNOUNCEMENTS = 2.0, 2
-"""Interval between announcements of the classic form, s, and their number."""
+"""Interval between the announcements of the classic form, s, and number of announcements."""
 _PING_S = 1.0
 _TYPES = {vrpn.PING: 0, vrpn.PONG: 1}
 _SENDER = 0
 
 
 class VrpnSession:
-    """One connection; after a loss, a new one is made.
+    """One connection. After a loss, the driver creates a new session.
 
     Parameters
     ----------
@@ -47,9 +47,9 @@ class VrpnSession:
     route : Route
         Numeric addresses of the server and of this host's network card.
     emit : Emit
-        Receives every chunk of the server.
+        Function that receives every chunk from the server.
     output : ServerOutput, optional
-        Output of the earlier connections.
+        Output that is shared with the earlier connections.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class VrpnSession:
         self._link: VrpnLink | None = None
 
     async def run(self) -> None:
-        """Connect and read until cancelled; raises the errors of `VrpnMocap.run`."""
+        """Connect and read until cancelled. The errors are those of `VrpnMocap.run`."""
         classic = self._settings.connection == "classic"
         connection = await (self._announce() if classic else self._connect())
         with VrpnLink(self._name, connection, _TYPES, self._take) as link:
@@ -105,7 +105,7 @@ class VrpnSession:
             ) from error
 
     async def _announce(self) -> TcpConnection:
-        """Ask the server by UDP to connect back."""
+        """Request the server by UDP to connect back."""
         host, local = self._route
         listener = TcpListener(local)
         try:
@@ -133,12 +133,12 @@ class VrpnSession:
         )
 
     async def _await_cookie(self, link: VrpnLink) -> None:
-        """Wait for the version of the server.
+        """Wait for the cookie with the version of the server.
 
         Raises
         ------
         DeviceMisconfiguredError
-            The program that answers is no VRPN server, or its major version differs.
+            The answering program is not a VRPN server, or its major version differs.
         """
         until = time.monotonic() + CONNECT_S
         while self._cookie is None and not self._foreign and time.monotonic() < until:
@@ -164,7 +164,7 @@ class VrpnSession:
     # --- received chunks ----------------------------------------------------------------------
 
     def _take(self, chunk: Chunk) -> None:
-        """Emit one chunk, and note what its arrival shows."""
+        """Emit one chunk, and store the consequences of its arrival."""
         emit = self._output.emit_answer
         for message in self._codec.feed(chunk.data):
             match message:
@@ -181,7 +181,7 @@ class VrpnSession:
             self._link.wake()
 
     async def _stream(self, link: VrpnLink) -> None:
-        """Wait for the end of the stream."""
+        """Wait until the stream ends."""
         began_ns = time.monotonic_ns()
         silence_s, pinged = self._settings.silence_s, False
         while True:
@@ -193,10 +193,10 @@ class VrpnSession:
             if quiet_s >= silence_s:
                 raise self._silence()
 
-            # Ask only a quiet server: some do not answer.
+            # Only a server without recent data is queried, because some servers do not answer.
             if quiet_s >= silence_s / 2:
                 if not pinged and self._codec.senders:
-                    # The first sender is the connection itself, which answers no ping.
+                    # The first sender is the connection itself, which does not answer pings.
                     name = next(reversed(self._codec.senders.values()))
                     link.send(vrpn.SenderDescription(_SENDER, name))
                     pinged = True
@@ -205,7 +205,7 @@ class VrpnSession:
             await link.pause(min(_PING_S, silence_s / 4))
 
     def _silence(self) -> DeviceLostError:
-        """Return the error of a server without poses, with its probable cause."""
+        """Return the error for a server that sends no poses, with the probable cause."""
         self._output.silent = True
         if self._pong_ns > self._pose_ns:
             cause = "it answers, but sends no body: bring the bodies into view, or start streaming"

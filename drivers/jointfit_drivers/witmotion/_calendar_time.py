@@ -1,9 +1,9 @@
-"""Calendar time of a WitMotion device as a continuous time.
+"""Conversion of the calendar time of a WitMotion device to a continuous time.
 
-The clock starts at an arbitrary date and may glitch: a time that contradicts the arrivals is not
-used. If the next times follow it, the clock was set, and they are used again.
+The clock starts at an arbitrary date and may glitch. A time that contradicts the arrivals is not
+used. If the next times continue it, the clock was set, and its times are used again.
 
-Invariant: a function of the times and arrivals fed.
+Invariant: the result depends only on the times and arrivals fed.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from __future__ import annotations
 from jointfit_protocols.witmotion import TICK_NS
 
 _SLACK_NS = 1_000_000_000
-"""Largest difference, ns, of elapsed device and arrival time without a glitch: longer than the
-delay of buffered bytes."""
+"""Largest difference between elapsed device time and arrival time without a glitch, ns. It exceeds
+the delay of buffered bytes."""
 _CONFIRMED = 3
-"""Consecutive times after a step that prove that the clock was set."""
+"""Number of consecutive times after a step that prove that the clock was set."""
 
 
 class CalendarTime:
-    """Calendar time of one device."""
+    """Checks the calendar time of one device."""
 
     def __init__(self) -> None:
         self._last: tuple[int, int] | None = None  # accepted ticks and their arrival
@@ -33,7 +33,7 @@ class CalendarTime:
         Parameters
         ----------
         ticks
-            Time as sent; None if it is not a time.
+            Time as sent, ms since 2000; None if the value is not a time.
         arrival_ns
             Arrival time of the sample, monotonic ns.
         """
@@ -52,14 +52,14 @@ class CalendarTime:
         return ticks
 
     def reading_ns(self, ticks: int | None, period_ns: float) -> int:
-        """Return the time of a raw reading, ns from the first reading.
+        """Return the time of a raw reading, ns since the first reading.
 
         Parameters
         ----------
         ticks
-            Accepted time of the sample, ms; None after a glitch.
+            Accepted time of the sample, ms; None if the time was a glitch.
         period_ns
-            Mean interval of the readings, ns, in place of a missing or implausible one.
+            Mean interval of the readings, ns. It replaces a missing or implausible interval.
         """
         passed_ns = round(period_ns)
         if ticks is not None and self._reading is not None and ticks > self._reading:
@@ -70,6 +70,6 @@ class CalendarTime:
 
 
 def _follows(last: tuple[int, int], ticks: int, arrival_ns: int) -> bool:
-    """Return whether device time advanced like the arrivals."""
+    """Return whether device time and arrival time advanced equally."""
     advance_ns = (ticks - last[0]) * TICK_NS
     return advance_ns >= 0 and abs(advance_ns - (arrival_ns - last[1])) <= _SLACK_NS

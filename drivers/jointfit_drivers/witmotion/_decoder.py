@@ -1,10 +1,9 @@
-"""Decoder of the WitMotion driver: chunks in, samples with canonical orientation out.
+"""Decoder of WitMotion devices: converts chunks to samples with canonical orientation.
 
-The frames of one sample follow each other in the order of their kinds: time, acceleration, rate,
-magnetic field, quaternion. None has a counter. A sample is stamped with the arrival of its first
-byte.
+The frames of one sample follow each other in the order time, acceleration, rate, magnetic field,
+quaternion. No frame has a counter. The stamp of a sample is the arrival of its first byte.
 
-Invariant: the output depends only on the chunks fed; the decoder reads no clock and no port.
+Invariant: the output depends only on the chunks fed. The decoder reads no clock and no port.
 """
 
 from __future__ import annotations
@@ -37,11 +36,11 @@ if TYPE_CHECKING:
     from jointfit_protocols.orientation import World
 
 _CHECKED_FRAMES = 100
-"""Frames after which missing kinds are reported: at least ten samples."""
+"""Number of frames after which missing kinds are reported. They contain at least ten samples."""
 _OTHER_FRAMES = 3
-"""Frames of the variant 55 61 that identify it; noise contains one by chance."""
+"""Number of frames that identify the variant 55 61. Noise may contain one such frame by chance."""
 _MOST_COUNT = 32_700
-"""Count of an acceleration or rate from which it counts as out of range."""
+"""Count from which an acceleration or rate is out of range."""
 _SCALE = 1.0 / FULL_SCALE
 _TIME = int(WitMotionFrameKind.TIME)
 _ACCELERATION = int(WitMotionFrameKind.ACCELERATION)
@@ -63,13 +62,14 @@ class WitMotionDecoder:
     baud : int, optional
         Line speed, bit/s, for back-dating of stamps; None for USB.
     world : World
-        World of the quaternion.
+        World of the quaternion that the device sends.
     inverse : bool
-        Whether the quaternion rotates world to sensor.
+        Whether the quaternion converts world to sensor coordinates.
     device_time : bool
         Whether samples contain the calendar time of the device.
     raw : RawSamples, optional
-        Computes orientations from raw measurements; None if the device sends orientations.
+        Filter that computes orientations from raw measurements; None if the device sends
+        orientations.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class WitMotionDecoder:
         raw: RawSamples | None = None,
     ) -> None:
         self.tick_clock = TickClock(TICK_NS, None) if device_time else None
-        """Time base of the samples; None if they are stamped on arrival alone."""
+        """Time base of the samples; None if samples are stamped only with their arrival."""
         self._world: World = world
         self._inverse, self._raw = inverse, raw
         self._stamps = ArrivalStamps(baud, FRAME_BYTES)
@@ -110,7 +110,7 @@ class WitMotionDecoder:
         return self._codec.discarded + self._refused * FRAME_BYTES
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return the content that `chunk` completed, in wire order; never raises."""
+        """Return the samples and events that `chunk` completes, in wire order; never raise."""
         out: list[Decoded] = []
         if self._codec.pending and self._stamps.is_silent_before(chunk.t_ns, len(chunk.data)):
             out = self.flush()
@@ -122,7 +122,7 @@ class WitMotionDecoder:
         return out
 
     def flush(self) -> list[Decoded]:
-        """Discard a pending frame."""
+        """Discard an incomplete frame."""
         return self._take(self._codec.flush())
 
     def _take(self, found: list[WitMotionFrame | CorruptBytes]) -> list[Decoded]:
@@ -153,7 +153,7 @@ class WitMotionDecoder:
         return self._stamps.stamp(self._codec.fed - frame.end + FRAME_BYTES)
 
     def _orientation(self, frame: WitMotionFrame) -> list[Decoded]:
-        """Return the sample of a quaternion frame."""
+        """Return the sample that a quaternion frame completes."""
         arrival_ns = self._arrival_of(frame)
         if self._ticks is not None:
             arrival_ns = self._first_ns
@@ -169,7 +169,7 @@ class WitMotionDecoder:
             else ImuSample(arrival_ns, q, native, ticks, None)
         ]
 
-        # Warn once if hardly any quaternion has norm 1.
+        # Warn once if hardly any quaternion has the norm 1.
         if not self._norm_checked and self._gate.judged:
             self._norm_checked, norm = True, self._gate.misconfigured_norm
             if norm is not None:
@@ -178,7 +178,7 @@ class WitMotionDecoder:
         return out
 
     def _measurement(self, frame: WitMotionFrame, raw: RawSamples) -> list[Decoded]:
-        """Take a raw frame; return the sample that it completes."""
+        """Process a raw frame; return the sample that it completes."""
         if frame.kind == _ACCELERATION:
             self._force = frame.data
             if self._ticks is None:
@@ -198,7 +198,8 @@ class WitMotionDecoder:
         if force is None or rate is None:
             return []  # a frame of this sample was lost
 
-        # The filter needs time between readings: the device's own, or the mean period instead.
+        # The filter needs time between readings: the device's time, or the mean period if it is
+        # missing.
         t_ns = self._calendar.reading_ns(ticks, raw.period_ns)
         self._ticks = None
         reading = RawReading(t_ns, rate_of(rate), acceleration_of(force), field)
@@ -215,7 +216,7 @@ class WitMotionDecoder:
         return Corrupt(FRAME_BYTES, reason, rejected=1)
 
     def _missing_kinds(self) -> list[Decoded]:
-        """Return the warning about kinds that the settings require and the device does not send."""
+        """Return a warning about required kinds of frames that the device does not send."""
         self._kinds_counted += 1
         if self._kinds_counted < _CHECKED_FRAMES:
             return []
@@ -228,7 +229,7 @@ class WitMotionDecoder:
 
 
 def missing_kinds(received: set[int], raw: RawSamples | None) -> set[int]:
-    """Return the kinds of frames without which there is no sample."""
+    """Return the kinds of frames that a sample requires and that were not received."""
     if raw is None:
         return {_QUATERNION} - received
     return {_ACCELERATION, _RATE, *((_FIELD,) if raw.magnetometer else ())} - received

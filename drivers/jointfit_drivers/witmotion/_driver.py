@@ -1,7 +1,7 @@
 """Driver of WitMotion IMUs (WT901, JY901, HWT905 and relatives) on a serial port.
 
 `WitMotionDecoder` is the pure part. `WitMotionImu.run` opens the port, makes the device send the
-required frames and reads until cancelled. `run` passes nothing but chunks to the decoder.
+required frames and reads until cancelled. The decoder receives only the chunks that `run` emits.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class WitMotionImu:
-    """One WitMotion device: orientation, stamped on arrival or with the device's calendar time."""
+    """One WitMotion device, stamped on arrival or with the device's calendar time."""
 
     Settings: ClassVar[type[WitMotionSettings]] = WitMotionSettings
     wire: ClassVar[Wire] = "stream"
@@ -50,8 +50,8 @@ class WitMotionImu:
         DeviceLostError
             The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            The file is not a serial port, the device uses another speed, no WitMotion device
-            answers, or it does not send the required frames even on request.
+            The file is not a serial port, or no WitMotion device answers. Or the device uses
+            another speed, or does not send the required frames even on request.
         """
         settings = self._settings
         with SerialPort(settings.port, settings.baud) as port:

@@ -1,11 +1,11 @@
-"""From an open port to a WitMotion device that sends the required frames, or to the error.
+"""Start of a WitMotion device: makes it send the required frames, or raises an error.
 
-The device acknowledges no write. The driver listens first, reads the settings where the firmware
-answers, writes only what differs, and listens again. Written registers are lost at power-off; flash
-is written only if ``persist`` allows it.
+The device does not acknowledge writes. The driver first listens, and reads the settings if the
+firmware answers. It writes only settings that differ, and listens again. The written registers are
+lost at power-off. The driver writes the flash memory only if ``persist`` permits it.
 
-Source: protocol pages of the vendor: 10 s of access after the unlock command, 100 ms between
-commands.
+Source: protocol pages of the vendor. The unlock command permits access for 10 s, and commands must
+be separated by 100 ms.
 """
 
 from __future__ import annotations
@@ -43,34 +43,35 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LINE_SPEEDS = (115_200, 9_600, 921_600, 230_400, 460_800, 57_600, 38_400, 19_200)
-"""Line speeds to search, bit/s: the usual one and the factory setting first."""
+"""Line speeds for the search, bit/s: usual speed and factory setting first."""
 _LISTEN_S = 0.6
-"""Longest time to receive the required frames, s: five samples at the factory rate of 10 Hz."""
+"""Longest time to receive the required frames, s, equal to five samples at the factory rate of 10
+Hz."""
 _SEARCH_S = 0.25
-"""Time at each other speed, s: two samples at 10 Hz."""
+"""Duration of the search at each other speed, s, equal to two samples at 10 Hz."""
 _ANSWER_S = 0.3
 """Longest wait for the answer to a read command, s."""
 _COMMAND_PAUSE_S = 0.1
-"""Pause after a command, as required by the vendor, s."""
+"""Pause after each command, which the vendor requires, s."""
 _ENOUGH = 2
-"""Frames of each required kind that show that the device sends it."""
+"""Number of frames of each required kind that prove that the device sends the kind."""
 _LEAST_RATE = 0.7
-"""Share of `rate_hz` below which the measured rate is another one."""
+"""Share of `rate_hz` below which the measured rate counts as different."""
 _LOGGED_BYTES = 20 * FRAME_BYTES
 
 
 class _Reception(NamedTuple):
-    """Result of listening."""
+    """Result of one period of listening."""
 
     counts: dict[int, int]
     """Number of frames of each kind."""
     received: int
-    """Number of bytes."""
+    """Number of received bytes."""
     other_frames: int
-    """Frames of the variant 55 61."""
+    """Number of frames of the variant 55 61."""
     seconds: float
     registers: tuple[int, int, int, int] | None
-    """Content of a register frame."""
+    """Content of a received register frame; None if none was received."""
 
 
 class WitMotionHandshake:
@@ -79,7 +80,7 @@ class WitMotionHandshake:
     Parameters
     ----------
     port, emit : SerialPort, Emit
-        Open port, and the receiver of the device's bytes once it sends the required frames.
+        Open port, and function that receives the device's bytes when it sends the required frames.
     settings : WitMotionSettings
         Table of the device in rig.toml.
     """
@@ -98,7 +99,7 @@ class WitMotionHandshake:
         DeviceLostError
             The device is silent or unplugged.
         DeviceMisconfiguredError
-            The device uses another speed, is of another kind or variant, or it does not send the
+            The device uses another speed, is of another kind or variant, or does not send the
             frames even on request.
         """
         settings = self._settings
@@ -132,7 +133,7 @@ class WitMotionHandshake:
     async def _listen(
         self, wait_s: float, until: Callable[[dict[int, int]], bool] | None = None
     ) -> _Reception:
-        """Receive for `wait_s` seconds, or until the counts of the frames suffice."""
+        """Receive for `wait_s` seconds, or until `until` accepts the counts of the frames."""
         loop = asyncio.get_running_loop()
         codec, registers = WitMotionCodec(), None
         counts: dict[int, int] = {}
@@ -155,7 +156,7 @@ class WitMotionHandshake:
         return _Reception(counts, codec.fed, codec.other_frames, seconds, registers)
 
     async def _read_settings(self) -> tuple[int, int, int, int] | None:
-        """Return content, rate, speed and the next register; None if the firmware is silent."""
+        """Return content, rate, speed and next register; None if the firmware does not answer."""
         await self._port.write(read_register(WitMotionRegister.CONTENT))
         answer = await self._listen(_ANSWER_S, lambda c: WitMotionFrameKind.REGISTERS in c)
         return answer.registers
@@ -163,7 +164,7 @@ class WitMotionHandshake:
     async def _differences(
         self, found: _Reception, registers: tuple[int, int, int, int] | None
     ) -> list[str]:
-        """Return the differences between the device and the settings; empty if none."""
+        """Return the differences between the device and the settings; empty if there are none."""
         faults = []
         missing = self._kinds - set(found.counts)
         if missing:
@@ -177,8 +178,8 @@ class WitMotionHandshake:
                 present = f"rate code 0x{registers[1]:02X}" if rate is None else f"{rate} Hz"
                 faults.append(f"it is set to {present}, not {rate_hz:g} Hz")
         elif not missing:
-            # Without an answer the stream shows only a rate that is too low: bytes that waited in
-            # a buffer arrive too fast.
+            # Without an answer, the stream can only prove a rate that is too low. Bytes that were
+            # buffered arrive too fast, so a high rate proves nothing.
             measured = await self._listen(_LISTEN_S)
             sent = min(measured.counts.get(kind, 0) for kind in self._kinds) / measured.seconds
             if sent < _LEAST_RATE * rate_hz:
@@ -186,7 +187,7 @@ class WitMotionHandshake:
         return faults
 
     async def _configure(self, faults: list[str]) -> None:
-        """Write content and rate, and check the frames that follow."""
+        """Write content and rate, and check the frames that the device sends afterwards."""
         settings = self._settings
         log.warning("%s: writing its settings: %s", settings.id, "; ".join(faults))
         commands = [
@@ -221,7 +222,7 @@ class WitMotionHandshake:
             await asyncio.sleep(_COMMAND_PAUSE_S)
 
     async def _find_at_other_speed(self) -> _Reception:
-        """Find the device at another speed and move it to `baud`, or raise the reason."""
+        """Find the device at another speed and change its speed to `baud`, or raise the error."""
         received = sum(len(chunk.data) for chunk in self._held)
         if not received:
             raise DeviceLostError(
@@ -247,7 +248,7 @@ class WitMotionHandshake:
         )
 
     async def _move_from(self, baud: int) -> _Reception:
-        """Change the speed of the device from `baud`, if ``persist`` allows it."""
+        """Change the speed of the device from `baud`, if ``persist`` permits this."""
         settings = self._settings
         code = BAUD_CODES.get(settings.baud)
         if not settings.persist or code is None:

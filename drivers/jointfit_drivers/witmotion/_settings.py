@@ -12,7 +12,7 @@ from jointfit_drivers.serial_imu import SerialImuSettings
 from jointfit_protocols.witmotion import FRAME_BYTES, RATE_CODES, WitMotionFrameKind
 
 _BITS = 10
-"""Bits of one byte on the line, 8N1."""
+"""Number of bits of one byte on the line (8N1)."""
 
 
 class WitMotionSettings(SerialImuSettings, GatewaySettings):
@@ -42,7 +42,7 @@ class WitMotionSettings(SerialImuSettings, GatewaySettings):
 
     @property
     def kinds(self) -> tuple[WitMotionFrameKind, ...]:
-        """Frames of one sample, in the order in which the device sends them."""
+        """Kinds of frames of one sample, in the order in which the device sends them."""
         if self.orientation == "gateway":
             kinds = (
                 WitMotionFrameKind.TIME,
@@ -64,7 +64,7 @@ class WitMotionSettings(SerialImuSettings, GatewaySettings):
     @field_validator("rate_hz")
     @classmethod
     def _rate_with_a_code(cls, rate_hz: float) -> float:
-        """Refuse rates for which the device has no setting."""
+        """Reject rates for which the device has no setting."""
         if rate_hz not in RATE_CODES:
             known = ", ".join(map(str, RATE_CODES))
             raise ValueError(f"expected one of {known} Hz, found {rate_hz:g}")

@@ -1,4 +1,4 @@
-"""Driver for Xsens Xbus IMUs on a serial port or USB."""
+"""Driver for Xsens IMUs that use the protocol Xbus on a serial port or USB."""
 
 from jointfit_drivers.xbus._decoder import XbusDecoder
 from jointfit_drivers.xbus._driver import XbusImu

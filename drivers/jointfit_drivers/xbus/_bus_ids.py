@@ -1,7 +1,7 @@
-"""Selection of one device on a line with several.
+"""Selection of one device on a line with several devices.
 
-Devices on one line differ in the bus id of their messages. The orientations of the devices belong
-to different segments, so that only the orientations of one device are used.
+Devices on one line differ in the bus id of their messages. The devices are attached to different
+segments, so only the orientations of one device may be used.
 
 Invariant: the result depends only on the bus ids fed.
 """
@@ -11,10 +11,11 @@ from __future__ import annotations
 from jointfit_daemon.model import DeviceEvent
 
 _MOST_OTHERS = 64
-"""Consecutive messages of other devices after which the selected one counts as absent: more than a
-line has devices."""
+"""Number of consecutive messages of other devices after which the selected device counts as absent.
+No line has that many devices."""
 _SIGHTINGS = 10
-"""Messages of other devices after which they are reported; a corrupt one may pass the checksum."""
+"""Number of messages of other devices after which they are reported. Single corrupt messages may
+pass the checksum."""
 
 
 class BusIdSelection:
@@ -44,7 +45,7 @@ class BusIdSelection:
         return False
 
     def report(self, bus_id: int) -> list[DeviceEvent]:
-        """Return a warning, once, about measurements with a `bus_id` that is not admitted."""
+        """Return a warning, once, about measurements whose `bus_id` is not the selected one."""
         self._sightings += 1
         if self._sightings != _SIGHTINGS or self._selected is None:
             return []
