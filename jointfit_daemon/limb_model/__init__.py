@@ -1,4 +1,4 @@
-"""The calibrated limb: the record of a calibration and the models that are evaluated every frame.
+"""Calibrated limb: record of a calibration, and models that are evaluated in every frame.
 
 The models are fitted in `jointfit_daemon.calibration` and evaluated in `jointfit_daemon.fusion`.
 """

@@ -1,11 +1,11 @@
-r"""Weighted mean of sensors that are aligned with the reference by constant rotations: a baseline.
+r"""Baseline model: weighted mean of sensors, each aligned with the reference by constant rotations.
 
 .. math:: \hat q = \operatorname{mean}_\omega \left( q_{W,m} \otimes q_m \otimes q_{B,m} \right)
 
-The model has constants only: for each sensor a rotation of its world about the vertical, a
+The model has three constants for each sensor: the rotation of its world about the vertical, a
 sensor-to-segment alignment and a weight. No term of the model depends on posture. The fitted
-heading absorbs soft-tissue artefact that correlates with flexion, so the model is valid only at the
-heading of the training movement.
+heading contains soft-tissue artefact that correlates with flexion. The model is therefore valid
+only at the heading of the training movement.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class AlignedModel(SegmentModel):
-    """Weighted mean of sensors with a constant rotation on either side."""
+    """Weighted mean of sensors, each multiplied by constant rotations on both sides."""
 
     kind: ClassVar[str] = "aligned"
 
     worlds: tuple[Quaternion, ...]
-    """q_optical_world of each sensor beyond its calibration: rotations about the vertical."""
+    """Correction of q_optical_world of each sensor, which is a rotation about the vertical."""
     mounts: tuple[Quaternion, ...]
-    """q_segment_bone of each sensor: correction of its sensor-to-segment alignment."""
+    """Correction q_segment_bone of the sensor-to-segment alignment of each sensor."""
     weights: tuple[float, ...]
     """Weight of each sensor; the sum is 1."""
     residual_sd: float
@@ -48,7 +48,7 @@ class AlignedModel(SegmentModel):
 
     @override
     def predict(self, sensors: Sequence[ArrayLike], q_other: ArrayLike | None = None) -> Array:
-        """Return the weighted mean, shape (n, 4); see `SegmentModel.predict`."""
+        """Return the weighted mean, shape (n, 4), as specified by `SegmentModel.predict`."""
         turned = [
             rotation.multiply(rotation.multiply(world, np.asarray(q, dtype=np.float64)), mount)
             for world, q, mount in zip(self.worlds, sensors, self.mounts, strict=True)

@@ -1,7 +1,8 @@
-"""The record of a calibration: all parameters that fusion evaluates, and quality figures.
+"""Record of a calibration, with all parameters that fusion evaluates and with quality figures.
 
-Invariants: ``Calibration.from_dict(c.to_dict()) == c`` to the last bit, also through JSON text. The
-record never contains NaN or infinity. Time of creation and software version are passed in.
+Invariants: ``Calibration.from_dict(c.to_dict()) == c`` to the last bit, even after a conversion to
+JSON text. The record never contains NaN or infinity. Time of creation and software version are
+arguments; this module does not read them.
 """
 
 from __future__ import annotations
@@ -24,12 +25,15 @@ if TYPE_CHECKING:
 Method = Literal["anchored", "patent12", "patent6", "markley", "mean", "single"]
 """Names of the fusion methods.
 
-`calibration.soft_tissue.fit_segment` fits them, and `tools.fuse` names them in its help."""
+`calibration.soft_tissue.fit_segment` fits the models of these methods, and the help of `tools.fuse`
+lists the names.
+"""
 
 Procedure = Literal["corrected", "patent"]
 """Steps of a calibration and of the fusion that uses it.
 
-``patent``: the published steps of the patent alone, with its regression; no correction of sensors.
+``patent`` uses only the published steps of the patent, with its regression and without correction
+of sensors. ``corrected`` includes the methods of this project.
 """
 
 SCHEMA = 1
@@ -45,8 +49,9 @@ class SensorCalibration:
     """Calibration of one sensor on its segment."""
 
     q_optical_world: Quaternion
-    """Rotation from the world of the sensor to the optical world (to the static world without
-    cameras)."""
+    """Rotation from the world of the sensor to the optical world or, without cameras, to the static
+    world.
+    """
     q_sensor_segment: Quaternion
     """Sensor-to-segment alignment from the static pose."""
     lag_ns: int = 0
@@ -62,10 +67,10 @@ class SegmentCalibration:
     q_static: Quaternion
     """q_optical_segment in the static pose."""
     length: float | None
-    """Distance between its joint centers, m; None if unknown."""
+    """Distance between the joint centers of the segment, m; None if unknown."""
     length_sd: float | None
     models: Mapping[str, SegmentModel] = field(default_factory=dict)
-    """Models by `model_key`: one for each trained set of sensors."""
+    """Models of the trained sets of sensors; `model_key` defines the keys."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +80,9 @@ class CalibratedCenter:
     center: Vector
     """Position of the center, m."""
     covariance: tuple[Vector, Vector, Vector]
-    """Covariance of the center, m²; persistent residuals count once per posture. 0 along
-    `unseen`."""
+    """Covariance of the center, m², which is 0 along `unseen`. Persistent residuals count once per
+    posture.
+    """
     unseen: tuple[Vector, ...]
     """Unit directions along which the movement did not determine the center."""
 
@@ -88,7 +94,7 @@ class JointCalibration:
     center: Vector | None
     """Position in the optical world during the static pose, m."""
     sd: float | None
-    """Root mean variance per axis, m."""
+    """Standard deviation of the position (root mean variance per axis), m."""
     source: str
     """``fit`` | ``length`` | ``unknown``."""
     residual_rms: float | None = None
@@ -96,7 +102,9 @@ class JointCalibration:
     gap_rms: float | None = None
     """RMS distance between the centers fixed in the two adjacent body parts, m."""
     rotation: CalibratedCenter | None = None
-    """Reference of the running centers; None without markers on both sides."""
+    """Center from the calibration movement, with which later estimates are compared. None if one
+    side of the joint has no markers.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +120,8 @@ class Calibration:
     joint: Mapping[str, JointCalibration]
     clusters: Mapping[str, StoredCluster] = field(default_factory=dict)
     flags: tuple[str, ...] = ()
-    """Flags repeated in every LimbState: ``headings_from_static``, ``facing_unknown``, …"""
+    """Flags that every LimbState repeats, such as ``headings_from_static`` and ``facing_unknown``.
+    """
     notes: tuple[str, ...] = ()
     """Notes for the operator on missing quantities, with remedies."""
     quality: Mapping[str, Any] = field(default_factory=dict)
@@ -123,19 +132,22 @@ class Calibration:
     links: tuple[SensorLink, ...] = ()
     """Expected relations between sensors; empty without a recorded movement."""
     correlations: Mapping[str, float] = field(default_factory=dict)
-    """Error correlation of the two segments at each inner joint, see `joint_error_correlations`."""
+    """Error correlation of the two segments at each inner joint, from `joint_error_correlations`.
+    """
     memory: str = ""
-    """Training frames, encoded by ``calibration.soft_tissue.pack``; the basis of online
-    learning."""
+    """Training frames for online learning, encoded by ``calibration.soft_tissue.pack``."""
     procedure: Procedure = "corrected"
-    """Procedure of the calibration. With ``patent``, every segment has one model, for all of its
-    sensors."""
+    """Procedure of the calibration. With ``patent``, every segment has only one model, which uses
+    all its sensors.
+    """
     chain: RefinedChain | None = None
     """Refined markers of the chain model; None if there are none."""
     parents: tuple[int | None, ...] = ()
-    """Segment proximal of each joint, as in `Chain`; empty for a limb without branches."""
+    """Number of the segment that is proximal to each joint, as in `Chain`; empty for a limb without
+    branches.
+    """
     left_joints: tuple[bool, ...] = ()
-    """Sides of the joints of a branched limb, as in `Chain`."""
+    """Whether each joint of a branched limb is on the left, as in `Chain`."""
 
     @property
     def lag_ns(self) -> dict[str, int]:
@@ -149,9 +161,9 @@ class Calibration:
         return mine == other
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the JSON form: dicts, lists, numbers, strings, None.
+        """Return the JSON form, which consists of dicts, lists, numbers, strings and None.
 
-        A limb without branches has no keys of branches, as in earlier versions.
+        For a limb without branches, the keys of branches are absent, as in earlier versions.
         """
         form = {"schema": SCHEMA, **fields_form(self)}
         for key in ("parents", "left_joints"):
@@ -161,7 +173,7 @@ class Calibration:
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> Calibration:
-        """Return the calibration of a JSON form.
+        """Return the calibration from its JSON form.
 
         Raises
         ------
@@ -183,7 +195,7 @@ class Calibration:
 
 
 class ChainFields(TypedDict):
-    """Fields of a calibration that identify its chain, see `Calibration.fits`."""
+    """Fields of a calibration that identify its chain; `Calibration.fits` compares them."""
 
     joints: tuple[str, ...]
     segments: tuple[str, ...]
@@ -204,7 +216,7 @@ def chain_fields(chain: Chain) -> ChainFields:
 
 
 def model_key(sensors: Sequence[str], other: str | None) -> str:
-    """Return the key of a model: available sensors of the segment, then sensors of its neighbor."""
+    """Return the key of a model, from the available sensors of the segment and of its neighbor."""
     return f"{'+'.join(sensors)}|{other or ''}"
 
 

@@ -1,4 +1,4 @@
-"""Conventions of the limb's joints and segments: angles, signs of flexion, configured lengths.
+"""Conventions of joints and segments: angles, signs of flexion, configured lengths.
 
 The joint types of chain models (ball, hinge, coupled) are in ``kinematics/chains/_model.py``.
 """
@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 
 
 TRUNK_JOINTS = ("trunk", "spine", "lumb", "neck", "cervic")
-"""Parts of the names of joints of the trunk, whose upper segment comes first in the chain."""
+"""Parts of the names of trunk joints, whose upper segment is the proximal segment of the chain."""
 SHOULDER_JOINTS = ("shoulder", "glenohumeral", "humerothoracic", "thoracohumeral")
-"""Parts of the names of joints whose angles are plane of elevation, elevation and rotation."""
+"""Parts of the names of joints with the angles plane of elevation, elevation and rotation."""
 FLEXES_FORWARD = ("hip", "ankle", "elbow", "wrist", *SHOULDER_JOINTS, *TRUNK_JOINTS)
-"""Parts of the names of joints whose flexion is a positive rotation about x (distal end forward).
-
-Knees and joints with other names flex with a negative rotation."""
+"""Parts of the names of joints whose flexion is a positive rotation about x, which moves the distal
+end forward. The flexion of knees and of joints with other names is a negative rotation.
+"""
 
 
 def angle_convention(chain: Chain, i: int) -> AngleConvention:

@@ -23,7 +23,7 @@ class InnerJoint(NamedTuple):
 
 
 def proximal_segment(chain: Chain, joint: int) -> int | None:
-    """Return the number of the segment proximal of a joint; None for the first joint."""
+    """Return the number of the segment proximal to a joint; None for the first joint."""
     if chain.parents:
         return chain.parents[joint]
     return joint - 1 if joint > 0 else None
@@ -45,10 +45,10 @@ def distal_joints(chain: Chain, segment: int) -> list[int]:
 
 
 def branch_runs(chain: Chain) -> list[list[int]]:
-    """Return runs of joints that are above each other in upright stance, from proximal to distal.
+    """Return runs of joints that are above each other when standing, from proximal to distal.
 
-    A limb without branches is one run. The two distal joints of the first segment of a branched
-    limb begin one run each.
+    A limb without branches is one run. In a branched limb, each of the two distal joints of the
+    first segment starts a run.
     """
     runs: list[list[int]] = []
     starts = [0]
@@ -65,7 +65,7 @@ def branch_runs(chain: Chain) -> list[list[int]]:
 
 
 def body_parts(chain: Chain) -> list[str | None]:
-    """Return all body parts: the proximal one, the segments, and those distal of the ends.
+    """Return the proximal body part, all segments, and the body parts distal to the chain's ends.
 
     `joint_parts` relates them to the joints.
     """
@@ -73,18 +73,18 @@ def body_parts(chain: Chain) -> list[str | None]:
 
 
 def joint_parts(chain: Chain) -> list[tuple[int, int]]:
-    """Return the numbers of the proximal and distal body part of each joint, see `body_parts`."""
+    """Return the numbers, in `body_parts`, of the proximal and distal body part of each joint."""
     above = (proximal_segment(chain, joint) for joint in range(len(chain.joints)))
     return [(0 if part is None else part + 1, joint + 1) for joint, part in enumerate(above)]
 
 
 def is_left(chain: Chain, joint: int) -> bool:
-    """Return whether a joint is on the left: adduction and rotation change sign."""
+    """Return whether a joint is on the left, where adduction and rotation change sign."""
     return chain.left_joints[joint] if chain.left_joints else chain.left_side
 
 
 def neighbor(chain: Chain, i: int) -> tuple[str, ...]:
-    """Return the sensors of the next segment (of the first branch), or else of the previous one."""
+    """Return the sensors of the next segment (of the first branch), or of the previous segment."""
     following = [joint for joint in distal_joints(chain, i) if joint < len(chain.segments)]
     if following:
         return chain.sensors[following[0]]

@@ -13,7 +13,7 @@ def fields_form(record: Any) -> dict[str, Any]:
 
 
 def json_form(value: Any) -> Any:
-    """Return the JSON form of a value: its ``to_dict()`` if it has one, tuples as lists."""
+    """Return the JSON form of a value, from ``to_dict()`` if defined; tuples become lists."""
     if hasattr(value, "to_dict"):
         return value.to_dict()
     if is_dataclass(value):

@@ -2,8 +2,8 @@ r"""One soft-tissue correction by kernel ridge regression.
 
 .. math:: c(u) = \mathrm{clip}(C^T [s(u), a_{z_1}(u / \ell) \dots a_{z_m}(u / \ell)])
 
-with the smooth terms s and the anchored bumps a of `_kernel_features`. An expert returns its
-correction and the leverage of the frame; `KernelModel` combines two experts.
+where s are the smooth terms and a the anchored bumps of `_kernel_features`. An expert returns its
+correction and the leverage of the frame. `KernelModel` combines two experts.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ class KernelExpert:
     width: float
     """Kernel width, rad; one of ``WIDTHS``."""
     tilted: bool
-    """Whether the tilt of the segment is among the regressors."""
+    """Whether the tilt of the segment is one of the regressors."""
     coefficients: Rows
-    """C^T: three rows, rad per unit of each smooth term and bump."""
+    """Matrix C^T with three rows, rad per unit of each smooth term and bump."""
     centers: Rows
     """Centers of the bumps, in kernel widths."""
     leverage: Rows
@@ -43,14 +43,15 @@ class KernelExpert:
     hull_leverage: float
     """0.995 quantile of the leverage over the training frames."""
     carried: tuple[float, ...]
-    """Sum of the stacking shares of each axis: the part of the correction that generalizes to
-    held-out frames."""
+    """Sum of the stacking shares of each axis, which is the part of the correction that generalizes
+    to held-out frames.
+    """
 
     def correct(self, u: Array, sensors: int) -> tuple[Array, Array]:
         """Return the correction, rad, shape (n, 3), and the leverage ratio, shape (n,).
 
-        The leverage ratio is the leverage of a frame over the 0.995 quantile of the leverages in
-        training.
+        The leverage ratio is the leverage of a frame divided by the 0.995 quantile of the leverages
+        in training.
 
         Parameters
         ----------
@@ -70,7 +71,7 @@ class KernelExpert:
 
     @staticmethod
     def read(data: Mapping[str, Any]) -> KernelExpert:
-        """Return the expert described by its JSON form."""
+        """Return the expert from its JSON form."""
         return KernelExpert(
             width=data["width"],
             tilted=data["tilted"],

@@ -1,15 +1,15 @@
-"""Regressors of the kernel model: joint rotation, sensor disagreement, tilt, and Gaussian bumps.
+"""Regressors of the kernel model, from joint rotation, sensor disagreement and tilt.
 
-Relative rotations are invariant to any constant rotation of the world, tilts to a rotation about
-the vertical. Relative rotations and tilts are therefore invariant to the heading of the subject.
-All regressors vanish if the sensors agree, the joint is straight and the segment is upright. This
-holds approximately in the static pose, where the correction must be zero, so the regression has no
-intercept.
+Relative rotations do not change with a constant rotation of the world, and tilts do not change with
+a rotation about the vertical. All regressors are therefore independent of the heading of the
+subject. They vanish if the sensors agree, the joint is straight and the segment is upright. This is
+approximately true in the static pose, in which the correction must be zero. The regression
+therefore has no intercept.
 
 .. math:: a_z(x) = e^{-|x - z|^2 / 2} - e^{-|x|^2 / 2} - e^{-|z|^2 / 2} + 1
 
-is the Gaussian kernel between x and a center z, minus the terms that do not vanish at x = 0. This
-is the kernel of all functions f(x) - f(0) for which f has the Gaussian kernel.
+is a *bump*: the Gaussian kernel between x and a center z, minus the terms that do not vanish at x =
+0. It is the kernel of all functions f(x) - f(0) for which f has the Gaussian kernel.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion
 
 PAIR_SHARE = 0.4
-"""Ratio of the kernel width of sensor disagreement to the kernel width of joint rotation: soft
-tissue moves less than joints."""
+"""Ratio of the kernel width of sensor disagreement to the kernel width of joint rotation. It is
+below 1, because soft tissue moves less than joints.
+"""
 TILTS = 3
 """Number of tilt components."""
 
@@ -49,7 +50,7 @@ def relative_rotations(sensors: Sequence[Array], mean: Array, q_other: Array) ->
     mean : ndarray, shape (n, 4)
         Mean of the sensors.
     q_other : ndarray, shape (n, 4)
-        The neighbouring segment, bone-aligned.
+        Bone-aligned orientation of the neighbouring segment.
     """
     inverse = rotation.conjugate(sensors[0])
     k = rotation.log(rotation.multiply(rotation.conjugate(mean), q_other))
@@ -60,7 +61,7 @@ def relative_rotations(sensors: Sequence[Array], mean: Array, q_other: Array) ->
 def relative_rotations_one(
     sensors: Sequence[Quaternion], mean: Quaternion, q_other: Quaternion
 ) -> list[float]:
-    """Return the relative rotations of one frame, see `relative_rotations`."""
+    """Return the result of `relative_rotations` for one frame."""
     found = [*difference_one(mean, q_other)]
     for q in sensors[1:]:
         found += difference_one(sensors[0], q)
@@ -70,7 +71,7 @@ def relative_rotations_one(
 def tilts(q: Array) -> Array:
     """Return :math:`[v_1, v_2, 1 - v_3]` for the vertical v in segment axes, shape (n, 3).
 
-    The tilt is a proxy for the proximal joint angle and for the effect of gravity on soft tissue.
+    The tilt represents the proximal joint angle and the effect of gravity on soft tissue.
     """
     w, x, y, z = q.T
     found: Array = np.stack(
@@ -80,7 +81,7 @@ def tilts(q: Array) -> Array:
 
 
 def tilts_one(q: Quaternion) -> list[float]:
-    """Return the tilts of one frame, see `tilts`."""
+    """Return the result of `tilts` for one frame."""
     w, x, y, z = q
     return [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 2.0 * (x * x + y * y)]
 
@@ -89,8 +90,8 @@ def smooth_terms(u: Array) -> Array:
     r"""Return :math:`[1 - \cos f, \sin f, 1 - \cos 2f, \sin 2f, f k_2, f k_3, u]`, f = k_1.
 
     f is the rotation about x, the flexion axis. The soft-tissue artefact is assumed to be a smooth
-    periodic function of flexion. Shape (n, 6 + columns of u); u may contain tilts after its
-    rotations.
+    periodic function of flexion. The result has the shape (n, 6 + columns of u). u may contain
+    tilts after the rotations.
     """
     f = u[:, :1]
     bends = [1.0 - np.cos(f), np.sin(f), 1.0 - np.cos(2.0 * f), np.sin(2.0 * f)]
@@ -98,7 +99,7 @@ def smooth_terms(u: Array) -> Array:
 
 
 def smooth_terms_one(u: Sequence[float]) -> list[float]:
-    """Return the smooth terms of one frame, see `smooth_terms`."""
+    """Return the result of `smooth_terms` for one frame."""
     f = u[0]
     s, c = sin(f), cos(f)
     return [1.0 - c, s, 2.0 * s * s, 2.0 * s * c, f * u[1], f * u[2], *u]

@@ -1,21 +1,21 @@
-r"""The recommended model: mean of the sensors with a posture-dependent soft-tissue correction.
+r"""Recommended model: mean of the sensors with a posture-dependent soft-tissue correction.
 
 .. math:: \hat q = \bar q \otimes \exp\bigl(\tfrac12 [\eta_a c_a + (1 - \eta_a) T_a]
           + \tfrac12 [\eta_b c_b + (1 - \eta_b) T_b]\bigr)
 
 :math:`\bar q` is the mean of the sensors of the segment. The corrections :math:`c_a` and
 :math:`c_b` are two fits (`KernelExpert`) of :math:`\rho = \log(\bar q^* \otimes q_{ref})`. Expert a
-uses relative rotations only and generalizes to other movements. Expert b also uses the tilt of the
-segment and has smaller errors on the trained movements. Inside the training range both have equal
-weight. Outside, both corrections fade (:math:`\eta`) into the linear trend T of `_kernel_trend`,
-which extrapolates best. Expert b fades at the limit of the training range, expert a at a larger
-distance. The trend has no component about the long axis. About this axis the correction of b fades
-to the correction of a, and the correction of a fades to zero.
+uses only relative rotations and generalizes to other movements. Expert b also uses the tilt of the
+segment and has smaller errors on the trained movements. Inside the training range both experts have
+equal weight. Outside, their weights :math:`\eta` decrease, and the linear trend T of
+`_kernel_trend`, which extrapolates best, replaces them. The weight of b decreases from the limit of
+the training range on, the weight of a from a larger distance on. The trend has no component about
+the long axis. About this axis, a replaces b, and zero replaces a.
 
 Invariants: the correction is zero if the segment is upright, the joint is straight and the sensors
 agree. A rotation of the world about the vertical does not change the correction.
 
-The claimed standard deviations come from held-out frames, for each axis, and increase with the
+The claimed standard deviations of the axes are estimated on held-out frames. They increase with the
 larger leverage ratio of the two experts.
 """
 
@@ -52,14 +52,15 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion
 
 HULL = 3.0
-"""Leverage ratio above which the weight of expert a is the root of HULL over the ratio.
-
-The weight of expert b is the inverse of its ratio from 1 on."""
+"""Leverage ratio above which the weight of expert a is the square root of HULL divided by the
+ratio. If the ratio of expert b exceeds 1, the weight of b is the inverse of the ratio.
+"""
 OUTSIDE = 3.0
-"""Leverage ratio of either expert above which a frame counts as extrapolation."""
+"""Leverage ratio of an expert above which a frame counts as extrapolation."""
 SHARE = 0.5
-"""Weight of expert b. Held-out frames hardly distinguish two similar experts, so weights are
-equal."""
+"""Weight of expert b. The weights are equal, because held-out frames hardly distinguish two similar
+experts.
+"""
 
 
 @dataclass(frozen=True)
@@ -74,17 +75,17 @@ class KernelModel(SegmentModel):
     tilted: KernelExpert
     """Expert b: regression on relative rotations and tilt."""
     trend: tuple[tuple[float, ...], tuple[float, ...]]
-    """T about x and y: coefficients of [1, relative rotations, tilts]."""
+    """Coefficients of the trend T about x and y, for [1, relative rotations, tilts]."""
     spread: LeverageVariance
     residual_sd: float
     mean_sd: float
-    """Standard deviation of the uncorrected mean in training, rad per axis.
-
-    This value is the standard deviation of the output without a neighboring segment."""
+    """Standard deviation of the uncorrected mean in training, rad per axis. It is the standard
+    deviation of the output if the neighboring segment has no data.
+    """
     _tables: KernelTables = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Derive the arrays that are multiplied in every frame.
+        """Compute the arrays that are multiplied in every frame.
 
         Raises
         ------
@@ -123,13 +124,14 @@ class KernelModel(SegmentModel):
         u = relative_rotations_one(sensors, mean, q_other)
         a, ratio, b, b_ratio, (tx, ty) = self._tables.correct(u, tilts_one(mean))
 
-        # Weights of the experts: a by the root of its leverage ratio, b by the ratio itself.
+        # The weight of a decreases with the root of its leverage ratio, the weight of b with the
+        # ratio.
         p = 1.0 - SHARE if ratio <= HULL else (1.0 - SHARE) * sqrt(HULL / ratio)
         s = SHARE / b_ratio if b_ratio > 1.0 else SHARE
         (ax, ay, az), (bx, by, bz) = a, b
         rest, along = 1.0 - p - s, p / (1.0 - SHARE)
 
-        # About z there is no trend: b fades into a, and a into the mean.
+        # There is no trend about z: a replaces b, and zero replaces a.
         c = (
             p * ax + s * bx + rest * tx,
             p * ay + s * by + rest * ty,

@@ -1,13 +1,14 @@
-r"""Precomputed arrays that evaluate two experts and the trend in two matrix products per frame.
+r"""Precomputed arrays to evaluate two experts and the trend by two matrix products per frame.
 
-The first product gives the exponents of all bumps, including the bump about zero,
+The first product contains the exponents of all bumps, including the bump about zero,
 
 .. math:: -\tfrac12 |x - z|^2 = [z / \ell, -\tfrac12 \ell^{-2}, -\tfrac12 |z|^2]
           \cdot [u, u^2, 1], \quad x = u / \ell
 
-together with the smooth terms and the Cholesky roots of the leverages. After one exponential and
-one square, the second product sums them. :math:`a_z(x)` needs each bump and the bump about zero,
-whose coefficient is minus the sum of all others.
+together with the smooth terms and the Cholesky roots of the leverages. The exponentials of the
+exponents and the squares of the roots are the input of the second product, which sums them.
+:math:`a_z(x)` needs each bump and the bump about zero, whose coefficient is minus the sum of all
+other coefficients.
 """
 
 from __future__ import annotations
@@ -38,16 +39,18 @@ class KernelTables:
     """Matrix of the first product, shape (bumps + p + q + 8, 2 width + 7).
 
     The product with [bends, u, u^2, 1] contains the exponents of all bumps, the roots of both
-    leverages, the smooth parts of both corrections, and the trend."""
+    leverages, the smooth parts of both corrections, and the trend. *Bends* are the smooth terms
+    without u.
+    """
     sums: Array
     """Matrix of the second product, shape (10, bumps + p + q + 8).
 
     The product with the bumps, squared roots, smooth parts and trend contains both corrections, the
     trend and both leverage ratios."""
     bumps: int
-    """Number of exponents at the start of the terms."""
+    """Number of exponents, which are the first elements of the product."""
     roots: int
-    """Index after the last root."""
+    """Index after the last root in the product."""
 
     @staticmethod
     def of(
@@ -58,7 +61,7 @@ class KernelTables:
         sensors, q = (width - TILTS) // 3, len(tilted.leverage)
         a, b = (_Part.of(expert, sensors, width, q) for expert in (plain, tilted))
 
-        # One row for each exponent, root, smooth part and trend component.
+        # Each exponent, root, smooth part and trend component has one row.
         smooth = np.concatenate([a.root, b.root, a.of_smooth, b.of_smooth])
         bumps, roots = len(a.exponents) + len(b.exponents), len(a.root) + len(b.root)
         table = np.zeros((bumps + len(smooth) + 2, 2 * width + _BENDS + 1))
@@ -68,7 +71,7 @@ class KernelTables:
         line = np.array(trend)
         table[-2:, -1], table[-2:, _BENDS : _BENDS + width] = line[:, 0], line[:, 1:]
 
-        # Sums over the evaluated rows: corrections of a and b, trend, leverages.
+        # The second product sums rows to the corrections of a and b, the trend and the leverages.
         sums = np.zeros((10, len(table)))
         sums[:3, : len(a.exponents)] = a.of_bumps
         sums[3:6, len(a.exponents) : bumps] = b.of_bumps
@@ -80,11 +83,11 @@ class KernelTables:
     def correct(
         self, u: Sequence[float], tilts: Sequence[float]
     ) -> tuple[Vector, float, Vector, float, tuple[float, float]]:
-        """Return correction (rad) and leverage ratio of a and of b, then T_x and T_y (rad)."""
+        """Return correction, rad, and leverage ratio of a and of b, then T_x and T_y, rad."""
         seen = [*u, *tilts]
         smooth = smooth_terms_one(seen)
         row = [*smooth, *[v * v for v in seen], 1.0]
-        terms = self.terms.dot(np.array(row, np.float64))  # an explicit type saves numpy its search
+        terms = self.terms.dot(np.array(row, np.float64))  # with a type NumPy is faster
 
         bumps, roots = terms[: self.bumps], terms[self.bumps : self.roots]
         np.exp(bumps, bumps)
@@ -115,7 +118,7 @@ class _Part:
         C = np.array(expert.coefficients)
         s = len(expert.leverage)
 
-        # The last center is zero: the bump that every anchored bump subtracts.
+        # The last center is zero. Every anchored bump subtracts the bump about zero.
         centers = np.zeros((len(expert.centers) + 1, width))
         if expert.centers:
             centers[:-1, : len(lengths)] = np.array(expert.centers)

@@ -3,9 +3,10 @@ r"""Linear trend of the soft-tissue artefact, used outside the training range.
 .. math:: T_j = c_j + \sum_i \beta_{ij} d_{ij} + \gamma_j v_{o(j)}, \qquad T_z = 0
 
 for the axes j = x, y, which are horizontal in the static pose. The terms are a constant, the
-disagreement d of each further sensor about the same axis (equivalent to other sensor weights), and
-the tilt about that axis. About z, the long axis of the segment, a constant and a heading are
-indistinguishable, so there is no trend. Headings do not change the trend.
+disagreement d of each further sensor about the same axis, and the tilt v about the same axis. The
+disagreement has the effect of other sensor weights. About z, the long axis of the segment, a
+constant and a heading are indistinguishable, so there is no trend. The trend does not depend on
+headings.
 """
 
 from __future__ import annotations

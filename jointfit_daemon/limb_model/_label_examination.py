@@ -1,6 +1,7 @@
-"""Search for exchanged labels in one frame, spread over the following frames.
+"""Search for exchanged labels in one frame, with the computation spread over later frames.
 
-Invariant: the result equals the result of `LabelSearch.explain`, for any frames during the search.
+Invariant: the result equals the result of `LabelSearch.explain`. Frames that arrive during the
+search do not change it.
 """
 
 from __future__ import annotations
@@ -12,22 +13,24 @@ if TYPE_CHECKING:
     from jointfit_daemon.limb_model._label_search import LabelFinding, LabelSearch
 
 _PART_NS = 20_000_000
-"""Time in which an examination does one part, ns: at 100 Hz one part per frame."""
+"""Time between two parts of an examination, ns, so that a stream at 100 Hz has at most one part per
+frame.
+"""
 _MOST_PARTS = 4
 """Largest number of parts in one frame."""
 
 
 class LabelExamination:
-    """Search in one frame, spread over the frames after it.
+    """Search for exchanged labels in one frame, whose parts are done in later frames.
 
     Parameters
     ----------
     search : LabelSearch
-        The clusters.
+        Search with the clusters.
     t_ns : int
         Instant of the frame.
     points : ndarray, shape (M, 3)
-        Markers in the order of its labels, m; NaN if hidden.
+        Marker positions in the order of the labels of `search`, m; NaN if hidden.
     """
 
     def __init__(self, search: LabelSearch, t_ns: int, points: Array) -> None:
@@ -36,10 +39,10 @@ class LabelExamination:
         self._parts = search.parts(points)
 
     def advance(self, t_ns: int) -> LabelFinding | None:
-        """Do the next parts of the search in a frame, and return the result of the last part.
+        """Do the next parts of the search; return the result after the last part, else None.
 
-        The number of parts depends on the time since the preceding frame, because some cameras are
-        slow.
+        The number of parts increases with the time since the preceding frame, so that the search
+        with slow cameras does not take longer.
         """
         count = min(1 + (t_ns - self._last_ns) // _PART_NS, _MOST_PARTS)
         self._last_ns = t_ns

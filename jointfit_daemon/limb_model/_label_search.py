@@ -1,13 +1,14 @@
-"""Search for exchanged marker labels in single frames, by clusters and their joint centers.
+"""Search for exchanged marker labels in single frames, from clusters and their joint centers.
 
 A hypothesis assigns a measured label to every marker of a cluster. Its cost is the negative
-logarithm of its likelihood: marker errors are Gaussian, an exchanged label is less probable than a
-correct one, and a marker at any other place is still less probable. If a cluster looks the same
-after an exchange, the exchange rotates the cluster. The joint centers of the cluster then differ
-from the joint centers of the adjacent clusters.
+logarithm of its likelihood. Marker errors are assumed to be Gaussian. An exchanged label is less
+probable than a correct label, and a marker that is at no marker position of a cluster is still less
+probable. If a cluster has nearly the same shape after an exchange, the exchange rotates the
+cluster. The joint centers of the cluster then differ from the joint centers of the adjacent
+clusters.
 
-Invariant: an explanation is unique. The cost of every other hypothesis is higher by at least
-`_MARGIN`. A search consists of short parts, which `LabelExamination` spreads over frames.
+Invariant: an explanation is unique, because the cost of every other hypothesis is higher by at
+least `_MARGIN`. A search consists of short parts, which `LabelExamination` spreads over frames.
 """
 
 from __future__ import annotations
@@ -34,76 +35,77 @@ if TYPE_CHECKING:
 SUSPICIOUS_M = 0.012
 """RMS residual of a cluster above which its labels are searched, m."""
 SMALLEST_M = 0.004
-"""RMS residual below which labels are never searched, m: the noise of markers on skin."""
+"""RMS residual below which labels are never searched, m. It is the noise of markers on skin."""
 DISPLACED_M = 0.02
-"""RMS residual of a cluster above which a single marker may be displaced, m: the accepted RMS error
-of markers, which soft-tissue artefact does not exceed for seconds."""
+"""RMS residual of a cluster above which a single marker may be displaced, m. It is the accepted RMS
+error of markers, which soft-tissue artefact does not exceed for long."""
 _SYMMETRY = 0.6
-"""RMS residual above which labels are searched, relative to the RMS residual of the least
-conspicuous exchange within the cluster."""
+"""RMS residual above which labels are searched, relative to the smallest RMS residual that an
+exchange within the cluster causes."""
 _MARKER_SD_M = 0.006
-"""Standard deviation of a marker's error, soft-tissue artefact included, m."""
+"""Standard deviation of a marker's error, including soft-tissue artefact, m."""
 _EXCHANGED_COST = 2.0
-"""Cost of a marker with the label of another one."""
+"""Cost of a marker with the label of another marker."""
 _ELSEWHERE_COST = 12.0
-"""Cost of a visible label at no place of a cluster."""
+"""Cost of a visible label that is at no marker position of a cluster."""
 _MARGIN = 2.5
-"""Least difference in cost of two explanations."""
+"""Smallest difference between the costs of the best and the next explanation."""
 _GAIN = 0.55
 """Largest RMS residual of an explanation, relative to the RMS residual of the unchanged labels."""
 _SMALL_M = 0.008
-"""RMS residual of an explanation that is always small enough, m."""
+"""RMS residual below which an explanation is always accepted, m."""
 _LARGE_M = 0.02
-"""RMS residual that is too large for an explanation, m."""
+"""RMS residual above which an explanation is always rejected, m."""
 GAP_M = 0.08
 """Distance of the two centers of a joint above which labels are searched, m."""
 _GAP_SD_M = 0.03
-"""Standard deviation of this distance, soft-tissue artefact and error of the center included, m."""
+"""Standard deviation of the distance of the two centers, including soft-tissue artefact, m."""
 _MOST_GAP_COST = 12.0
-"""Largest cost of the distance at one joint, which equals the cost of a marker elsewhere."""
+"""Largest cost of the distance of the centers at one joint, equal to `_ELSEWHERE_COST`."""
 _NEAR_M = 0.025
-"""RMS residual up to which a label is at the place of a hidden marker, m."""
+"""RMS residual below which a label is considered to be at the position of a hidden marker, m."""
 _TOLERANCE_M = 0.03
-"""Greatest difference of the distance of two markers from that in the cluster, m."""
+"""Largest difference of the distance of two markers from their distance in the cluster, m."""
 _MOST_COMPARED = 12
-"""Largest number of markers of a cluster for which all exchanges are compared, about 5000. The
-number of exchanges grows with its fourth power; in a larger cluster, each marker is exchanged with
-its nearest one only."""
+"""Largest number of markers in a cluster for which all exchanges, about 5000, are compared. The
+number of exchanges grows with the fourth power of the number of markers. In a larger cluster, each
+marker is exchanged only with its nearest marker."""
 _MOST_CHANGED = 4
 """Largest number of changed labels in one cluster."""
 _BEST = 16
 """Number of assignments of one cluster that are combined with the assignments of other clusters."""
 _MOST_COMBINED = 2000
-"""Largest number of partial combinations: none of a healthy limb has more than a few."""
+"""Largest number of partial combinations. A limb without faults has only a few."""
 _COMBINED_AT_ONCE = 150
 """Number of partial combinations in one part of a search."""
 _SAMPLED = 40
-"""Frames of a trial in which labels are searched."""
+"""Number of frames of a trial in which labels are searched."""
 _CONFIRMED = 0.5
-"""Share of the suspicious frames of a trial that an explanation needs."""
+"""Fraction of the suspicious frames of a trial that an explanation must explain."""
 
 
 class LabelFault(NamedTuple):
-    """Labels of one frame that are not at their own places."""
+    """Labels of one frame that are not at the positions of their markers."""
 
     markers: tuple[str, ...]
-    """Each marker is at the place of the next marker, the last marker at the place of the first. A
-    single marker is at no place of a cluster."""
+    """Names of the markers. Each label is at the position of the next marker, and the last at the
+    position of the first. A single label is at no marker position of a cluster."""
     parts: tuple[str, ...]
-    """Body parts of these markers, sorted."""
+    """Body parts of the markers, sorted."""
     cycle: bool = True
-    """Whether the last marker is at the place of the first marker, not hidden."""
+    """Whether the last label is at the position of the first marker. If False, the last marker is
+    hidden."""
 
     @property
     def places(self) -> str:
-        """Return which marker is at whose place, as a clause."""
+        """Return a clause on the positions of the markers."""
         names = self.markers
         following = zip(names, names[1:] + (names[:1] if self.cycle else ()), strict=False)
         return join_words(f"{name} is at the place of {other}" for name, other in following)
 
     @property
     def text(self) -> str:
-        """Return what is wrong with two or more markers, as a sentence without its end."""
+        """Return a sentence on two or more markers, without a full stop."""
         if self.cycle:
             return f"{join_words(self.markers)} look exchanged: {self.places}"
         names = join_words(self.markers[:-1])
@@ -117,12 +119,12 @@ class LabelFinding(NamedTuple):
     """Result of the search in one frame."""
 
     rms: Array
-    """RMS residual of each cluster with its own labels, m, shape (P,); NaN without a fit."""
+    """RMS residual of each cluster with the unchanged labels, m, shape (P,); NaN without a fit."""
     faults: tuple[LabelFault, ...]
 
 
 class _Frame(NamedTuple):
-    """Markers of one frame; the last row belongs to no marker."""
+    """Markers of one frame. The last row is NaN and belongs to no marker."""
 
     points: Array
     """Positions of the markers, m, shape (M + 1, 3)."""
@@ -132,7 +134,7 @@ class _Frame(NamedTuple):
 
 
 class _Assignment(NamedTuple):
-    """Labels of one cluster in a hypothesis, as columns; -1 is hidden or elsewhere."""
+    """Labels of one cluster in a hypothesis, as columns; -1 is hidden or displaced."""
 
     columns: tuple[int, ...]
     cost: float
@@ -152,7 +154,7 @@ class _Fits(NamedTuple):
     """Means of the markers in template and frame, m, shape (n, 3)."""
 
     def carry(self, points: Array) -> Array:
-        """Return points of the template in the frame, m, shapes (n, J, 3)."""
+        """Transform points of the template to the frame, m, shape (n, J, 3)."""
         turned = (points - self.template_mean[:, None]) @ np.swapaxes(self.rotation, 1, 2)
         return np.asarray(turned + self.mean[:, None])
 
@@ -163,9 +165,9 @@ class LabelSearch:
     Parameters
     ----------
     clusters : iterable of MarkerCluster
-        Clusters of markers. Rigid bodies are ignored.
+        Marker clusters. Rigid bodies are ignored.
     centers : mapping of tuple of str to ndarray, optional
-        Joint centers in the static world, m, shape (3,), by the body parts beside each joint.
+        Joint centers in the static world, m, shape (3,), by the two body parts of each joint.
     """
 
     def __init__(
@@ -180,7 +182,7 @@ class LabelSearch:
         self._own = [np.arange(a, b) for a, b in pairwise(ends)]
         """Columns of the markers of each cluster."""
 
-        # Clusters of different sizes in one array; unused rows have weight 0.
+        # Clusters of different sizes are in one array, whose unused rows have the weight 0.
         most = max((len(own) for own in self._own), default=0)
         self._template = np.zeros((len(self.clusters), most, 3))
         self._columns = np.full((len(self.clusters), most), -1)
@@ -188,7 +190,8 @@ class LabelSearch:
             self._template[p, : len(own)] = cluster.template
             self._columns[p, : len(own)] = own
 
-        # Joint centers in the coordinates of the templates, NaN for parts beside other joints.
+        # Joint centers in the coordinates of the templates; NaN if the part is not adjacent to the
+        # joint.
         given = {} if centers is None else centers
         self._centers = np.full((len(self.clusters), len(given), 3), np.nan)
         for j, (parts, center) in enumerate(given.items()):
@@ -199,12 +202,12 @@ class LabelSearch:
         self._limits = np.array([_suspicious_rms(cluster.template) for cluster in self.clusters])
 
     def explain(self, points: Array) -> LabelFinding:
-        """Return the residuals of the clusters in one frame, and faulty labels that explain them.
+        """Return the residuals of the clusters in one frame, and label faults that explain them.
 
         Parameters
         ----------
         points : ndarray, shape (M, 3)
-            Markers in the order of `labels`, m; NaN if hidden.
+            Marker positions in the order of `labels`, m; NaN if hidden.
         """
         parts = self.parts(points)
         while True:
@@ -217,8 +220,8 @@ class LabelSearch:
     def parts(self, points: Array) -> Generator[None, None, LabelFinding]:
         """Search like `explain`, and yield between the parts of the search.
 
-        The fit of all clusters is one part, which ends the search if they fit. Every suspect
-        cluster is another one, and so are some of the combinations of their labels.
+        The first part fits all clusters; if they fit, the search ends. Then each suspect cluster is
+        one part, and each group of combinations of their labels is one part.
         """
         padded = np.concatenate((points, np.full((1, 3), np.nan)))
         seen = np.isfinite(padded).all(axis=1)
@@ -227,7 +230,7 @@ class LabelSearch:
         fits = _fit(self._template, padded[self._columns], seen[self._columns])
         rms, centers = fits.rms, fits.carry(self._centers)
 
-        # The visible markers of other clusters determine no pose.
+        # The visible markers of other clusters do not determine a pose.
         fitted = np.array(
             [
                 seen[own].sum() >= MIN_MARKERS and not self._is_line(p, seen[own])
@@ -236,7 +239,8 @@ class LabelSearch:
         )
         rms[~fitted], centers[~fitted] = np.nan, np.nan
 
-        # Clusters that do not fit, and both sides of a joint whose centers are apart.
+        # Suspect are clusters that do not fit, and both clusters of a joint whose centers are
+        # apart.
         suspect = rms > self._limits
         for at in np.swapaxes(centers, 0, 1):
             (beside,) = np.nonzero(np.isfinite(at[:, 0]))
@@ -249,7 +253,7 @@ class LabelSearch:
         return LabelFinding(rms, faults)
 
     def neighbors(self, parts: Iterable[str]) -> frozenset[str]:
-        """Return the body parts that share a joint with some parts."""
+        """Return the body parts that share a joint with any of `parts`."""
         rows = [p for p, cluster in enumerate(self.clusters) if cluster.name in set(parts)]
         shared = np.isfinite(self._centers[rows, :, 0]).any(axis=0)
         near = np.isfinite(self._centers[:, shared, 0]).any(axis=1)
@@ -286,7 +290,8 @@ class LabelSearch:
             own = self._own[p].tolist()
             place_of |= {c: s for c, s in zip(columns, own, strict=True) if c not in (-1, s)}
             kept = {c for others in best for c in others}
-            # A fit without one marker is always better: soft-tissue artefact is not a fault.
+            # A fit without one marker always has a smaller residual. The limit prevents that
+            # soft-tissue artefact counts as a fault.
             if rms[p] > DISPLACED_M:
                 elsewhere += [s for s in own if seen[s] and s not in kept]
         for label in elsewhere:
@@ -298,8 +303,8 @@ class LabelSearch:
     def _assignments(self, p: int, frame: _Frame, pool: Rows, rms: float) -> list[_Assignment]:
         """Return the best assignments of one cluster, with its own labels first.
 
-        Labels are added marker by marker; an assignment ends where two markers have a distance
-        other than in the cluster.
+        Labels are added marker by marker. An assignment is dropped if the distance of two markers
+        differs from their distance in the cluster.
         """
         own, template, seen = self._own[p], self.clusters[p].template, frame.seen
         apart = np.sqrt(((template[:, None] - template[None]) ** 2).sum(axis=-1))
@@ -307,14 +312,14 @@ class LabelSearch:
         most_hidden = int((~seen[own]).sum()) + 1
         found: Rows = np.zeros((1, 0), dtype=np.intp)
         for s in range(len(own)):
-            # Every label, or none, for the next marker.
+            # The next marker gets every label, or none.
             grown = np.column_stack(
                 (np.repeat(found, len(options), axis=0), np.tile(options, len(found)))
             )
             new, before = grown[:, -1:], grown[:, :-1]
             off = np.abs(frame.distances[new, before] - apart[s, :s])
 
-            # Distances of the cluster, every label once, few changes.
+            # Keep assignments with the distances of the cluster, different labels and few changes.
             fits = ((off < _TOLERANCE_M) | (new < 0) | (before < 0)).all(axis=1)
             fits &= ((new != before) | (new < 0)).all(axis=1)
             fits &= (grown < 0).sum(axis=1) <= most_hidden
@@ -325,7 +330,7 @@ class LabelSearch:
         enough = used.sum(axis=1) >= MIN_MARKERS
         found, used = found[enough], used[enough]
         identity = np.where(seen[own], own, -1)
-        # The labels as they are come first.
+        # The unchanged labels come first.
         found = np.concatenate(([identity], found))
         used = np.concatenate(([seen[own]], used))
         fits = _fit(np.broadcast_to(template, (*found.shape, 3)), frame.points[found], used)
@@ -343,7 +348,7 @@ class LabelSearch:
         ]
 
     def _is_line(self, p: int, used: NDArray[np.bool_]) -> bool:
-        """Return whether some markers of a cluster are on a line."""
+        """Return whether the selected markers of a cluster are on a line."""
         key = (p, used.tobytes())
         if key not in self._lines:
             self._lines[key] = is_line(self.clusters[p].template[used])
@@ -357,7 +362,7 @@ class LabelSearch:
         suspects: Sequence[int],
         label: int,
     ) -> int | None:
-        """Return the hidden marker of a cluster without faults at whose place a label is."""
+        """Return the hidden marker, of a cluster without faults, at whose position a label is."""
         found = []
         for p, own in enumerate(self._own):
             if p in suspects or not np.isfinite(rms[p]):
@@ -376,7 +381,7 @@ class LabelSearch:
         """Return the chains and cycles of exchanged labels."""
         groups = []
         left = dict(place_of)
-        ends = [c for c in place_of if c not in set(place_of.values())]  # open chains first
+        ends = [c for c in place_of if c not in set(place_of.values())]  # open chains come first
         for first in [*ends, *sorted(place_of)]:
             group, c = [], first
             while c in left:
@@ -397,7 +402,7 @@ class LabelSearch:
 
 
 def explain_trial(search: LabelSearch, positions: Array) -> tuple[LabelFault, ...]:
-    """Return the faulty labels that explain most of the suspicious frames of a trial.
+    """Return the label faults that explain most of the suspicious frames of a trial.
 
     Parameters
     ----------
@@ -412,7 +417,7 @@ def explain_trial(search: LabelSearch, positions: Array) -> tuple[LabelFault, ..
     names = [cluster.name for cluster in search.clusters]
     confirmed = []
     for fault, count in votes.items():
-        # Frames in which a cluster of the fault does not fit, or is explained by it.
+        # Frames in which a cluster of the fault does not fit, or which the fault explains.
         parts = [names.index(part) for part in fault.parts]
         suspicious = sum(
             bool((finding.rms[parts] > MAX_FIT_RMS_M).any()) or fault in finding.faults
@@ -424,9 +429,10 @@ def explain_trial(search: LabelSearch, positions: Array) -> tuple[LabelFault, ..
 
 
 def _suspicious_rms(template: Array) -> float:
-    """Return the residual above which the labels of a cluster are searched, m.
+    """Return the RMS residual above which the labels of a cluster are searched, m.
 
-    This threshold is smaller for a cluster that looks almost the same after an exchange of labels.
+    The threshold is smaller for a cluster that has almost the same shape after an exchange of
+    labels.
     """
     count = len(template)
     if count <= _MOST_COMPARED:
@@ -437,7 +443,8 @@ def _suspicious_rms(template: Array) -> float:
             for order in _orders(count, rows)
         ]
     else:
-        # A rigid fit hardly absorbs few exchanges among many markers, so close ones look alike.
+        # With many markers a rigid fit hardly adapts to one exchange, so only close markers are
+        # tested.
         distances = np.linalg.norm(template[:, None] - template, axis=2)
         np.fill_diagonal(distances, np.inf)
         pairs = {(min(a, b), max(a, b)) for a, b in enumerate(distances.argmin(axis=1).tolist())}
@@ -465,7 +472,7 @@ def _orders(count: int, rows: tuple[int, ...]) -> list[list[int]]:
 def _fit(template: Array, points: Array, seen: NDArray[np.bool_]) -> _Fits:
     r"""Return the rigid fits of n sets of k markers (Kabsch 1976).
 
-    With the singular values s of the cross moment, the sum of squared residuals is
+    If s are the singular values of the cross moment, the sum of squared residuals is
     :math:`\sum |a|^2 + \sum |y|^2 - 2 (s_1 + s_2 \pm s_3)`.
 
     Parameters
@@ -473,7 +480,7 @@ def _fit(template: Array, points: Array, seen: NDArray[np.bool_]) -> _Fits:
     template, points : ndarray, shape (n, k, 3)
         Markers of the cluster and of the frame, m.
     seen : ndarray, shape (n, k)
-        Markers to fit.
+        Mask of the markers to fit.
     """
     w = seen[..., None]
     count = np.maximum(seen.sum(axis=1), 1)[:, None]
@@ -490,12 +497,12 @@ def _fit(template: Array, points: Array, seen: NDArray[np.bool_]) -> _Fits:
 
 
 def _gap_costs(one: Array, other: Array) -> Array:
-    """Return the costs of distances of the same joint centers, shape (n, m).
+    """Return the costs of the distances between the joint centers of two clusters, shape (n, m).
 
     Parameters
     ----------
     one, other : ndarray, shapes (n, J, 3) and (m, J, 3)
-        Joint centers of n assignments of a cluster and m of another one, m.
+        Joint centers of n assignments of one cluster, and of m assignments of another cluster, m.
     """
     square = ((one[:, None] - other[None]) ** 2).sum(axis=-1) / (2.0 * _GAP_SD_M**2)
     return np.asarray(np.nansum(np.minimum(square, _MOST_GAP_COST), axis=-1))
@@ -511,17 +518,18 @@ def _combine(
 ) -> Generator[None, None, list[tuple[int, ...]] | None]:
     """Return the assignments with the least cost in which every label is used once.
 
-    None if the labels of every cluster are its own, or if another combination is hardly worse.
+    The result is None if no label is changed, or if the cost of another combination is almost as
+    low.
     """
-    # The columns of an assignment, as bits.
+    # Each mask contains the columns of an assignment as bits.
     masks = [[sum(1 << c for c in one.columns if c >= 0) for one in each] for each in options]
     orders = [np.argsort([-one.cost for one in each]).tolist() for each in options]
-    rest = [0.0]  # least cost of the clusters that are not assigned yet
+    rest = [0.0]  # least cost of the clusters without assignment
     for each in reversed(options):
         rest.append(rest[-1] + min(one.cost for one in each))
     rest.reverse()
 
-    # Cost of the joints between two of the clusters, for every pair of their assignments.
+    # Costs of the joints between two clusters, for every pair of their assignments.
     centers = [np.array([one.centers for one in each]) for each in options]
     gaps = {
         (q, p): _gap_costs(centers[q], centers[p]).tolist()
@@ -548,7 +556,7 @@ def _combine(
             continue
         stack += [
             (cost + options[p][i].cost, taken | masks[p][i], (*chosen, i))
-            for i in orders[p]  # the last one, with the least cost, is visited first
+            for i in orders[p]  # the last, with the least cost, is visited first
             if not taken & masks[p][i]
         ]
     close = [chosen for cost, chosen in sorted(found) if cost <= best + _MARGIN]

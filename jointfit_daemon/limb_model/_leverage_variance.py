@@ -2,7 +2,8 @@ r"""Variance of a correction as a function of the distance from the training ran
 
 .. math:: \sigma_j^2(r) = a_j + b_j \max(0, \min(r, 30) - \tfrac12)
 
-for each axis j, with r the leverage of a frame over its 0.995 quantile in training.
+for each axis j. r is the leverage of a frame divided by the 0.995 quantile of the leverage in
+training.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ class LeverageVariance:
     """Variances of the three axes as a function of the leverage ratio."""
 
     inside: Vector
-    """a: variance within the training range, rad², by axis."""
+    """Coefficients a: variance within the training range by axis, rad²."""
     outside: Vector
-    """b: growth of the variance per unit of the leverage ratio, rad², by axis."""
+    """Coefficients b: increase of the variance per unit of the leverage ratio by axis, rad²."""
 
     def at(self, ratio: float) -> Vector:
         """Return the standard deviations about x, y and z of the segment, rad."""
@@ -42,5 +43,5 @@ class LeverageVariance:
 
     @staticmethod
     def read(data: Mapping[str, Any]) -> LeverageVariance:
-        """Return the variances of a JSON form."""
+        """Return the variances from their JSON form."""
         return LeverageVariance(vector(data["inside"]), vector(data["outside"]))

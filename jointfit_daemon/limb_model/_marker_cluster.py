@@ -1,4 +1,4 @@
-"""Marker clusters of body parts as they were in the static pose, as arrays and as stored data."""
+"""Marker clusters of body parts in the static pose, as arrays and as stored data."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ class MarkerCluster:
     """Name of the rigid body in the stream, or None."""
     template: Array
     """Marker positions minus `origin`, static world, m, shape (k, 3). A rigid body has four virtual
-    points 0.1 m around its origin, so that markers and rigid bodies are processed alike."""
+    points 0.1 m around its origin, so that the same code processes markers and rigid bodies.
+    """
     origin: Array
     """Centroid of the markers or origin of the rigid body, static world, m, shape (3,)."""
     q_body: Array
@@ -63,7 +64,7 @@ def cluster_record(cluster: MarkerCluster) -> StoredCluster:
 
 
 def restore_cluster(name: str, stored: StoredCluster) -> MarkerCluster:
-    """Return the cluster of a calibration as arrays."""
+    """Return a stored cluster as arrays."""
     return MarkerCluster(
         name,
         stored.markers,

@@ -32,7 +32,7 @@ class MeanModel(SegmentModel):
 
     @override
     def predict(self, sensors: Sequence[ArrayLike], q_other: ArrayLike | None = None) -> Array:
-        """Return the weighted mean, shape (n, 4); see `SegmentModel.predict`."""
+        """Return the weighted mean, shape (n, 4), as specified by `SegmentModel.predict`."""
         return fuse([np.asarray(q, dtype=np.float64) for q in sensors], self.weights)
 
     @override

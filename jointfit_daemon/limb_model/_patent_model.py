@@ -1,10 +1,11 @@
-r"""Multiple linear regression of quaternion components, in two readings of the patent.
+r"""Multiple linear regression of quaternion components, in two interpretations of the patent.
 
 .. math:: \hat Y_k = \sum_m a_{k m} X_{m,k} + c_k, \qquad k = w, x, y, z
 
-This is a baseline. ``patent12`` fits every component separately (12 parameters for two sensors),
-``patent6`` uses the same sensor coefficients for all components (6 parameters). Neither is
-equivariant to the heading: the intercept fixes the fit to the heading of the training movement.
+X are the components of the sensors and Y the components of the segment. The model is a baseline.
+``patent12`` fits every component separately, with 12 parameters for two sensors. ``patent6`` uses
+the same sensor coefficients for all components, with 6 parameters. Both are valid only at the
+heading of the training movement, because of the intercept c.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 PatentReading = Literal["patent12", "patent6"]
 
 SHORTEST = 0.5
-"""Norm of the regression output below which the mean of the sensors replaces it."""
+"""Norm of the regression output below which the output is replaced by the mean of the sensors."""
 
 
 @dataclass(frozen=True)
@@ -43,16 +44,20 @@ class PatentModel(SegmentModel):
 
     reading: PatentReading
     coefficients: tuple[tuple[float, ...], ...]
-    """Four rows w, x, y, z; one column for each sensor, the intercept last."""
+    """Coefficients in four rows w, x, y, z. Each sensor has a column; the last column is the
+    intercept.
+    """
     q_sign: Quaternion
-    """First reference of the training data; inputs get the sign with a non-negative product."""
+    """First reference of the training data. The sign of each input is changed if its product with
+    it is negative.
+    """
     residual_sd: float
     movements: int
     """Number of distinct movements in the training data."""
 
     @override
     def predict(self, sensors: Sequence[ArrayLike], q_other: ArrayLike | None = None) -> Array:
-        """Return the regression, shape (n, 4); see `SegmentModel.predict`."""
+        """Return the regression, shape (n, 4), as specified by `SegmentModel.predict`."""
         inputs = [rotation.align_hemisphere(q, self.q_sign) for q in sensors]
         table = np.array(self.coefficients)
         said: Array = table[:, -1] + sum(a * q for a, q in zip(table.T, inputs, strict=False))

@@ -1,7 +1,7 @@
-"""Marker positions of a chain model, refined by a calibration.
+"""Marker positions of a chain model that a calibration refined.
 
-Invariant: positions are used only with the model that they were refined in. Other joints, axes or
-nominal positions give another fingerprint.
+Invariant: positions are used only with the model in which they were refined. A model with other
+joints, axes or nominal positions has another fingerprint.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Vector
 
 _DIGITS = 9
-"""Decimal places of the numbers in a fingerprint: a nanometre, so that rounding has no effect."""
+"""Decimal places of the numbers in a fingerprint. The resolution is a nanometre, so that rounding
+has no effect.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +36,7 @@ class RefinedChain:
     """Position of every refined marker in the axes of its segment, m."""
 
     def apply(self, model: ChainModel) -> ChainModel | None:
-        """Return the model with the refined positions; None for another model."""
+        """Return the model with the refined positions; None if the fingerprint differs."""
         if chain_fingerprint(model) != self.fingerprint:
             return None
         return model.with_markers([self.positions.get(m.name, m.position) for m in model.markers])

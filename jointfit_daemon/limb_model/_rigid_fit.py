@@ -1,6 +1,6 @@
 """Rigid motions of marker clusters, fitted to the visible markers of every frame.
 
-NaN means that a marker is not visible, and propagates.
+NaN marks an invisible marker, and propagates through all computations.
 """
 
 from __future__ import annotations
@@ -22,20 +22,25 @@ MIN_MARKERS = 3
 """Smallest number of visible markers of a rigid fit."""
 
 MIN_WIDTH_M = 0.006
-"""Smallest RMS width of a cluster perpendicular to its longest line, m; narrower is a line."""
+"""Smallest RMS width of a cluster perpendicular to its longest line, m. A narrower cluster counts
+as a line.
+"""
 
 MIN_WIDTH_SHARE = 0.08
-"""Smallest RMS width as a share of the length; limits the error of the rotation about the line."""
+"""Smallest RMS width as a fraction of the length, which limits the rotation error about the line.
+"""
 
 MAX_BRIDGE = 60
 """Longest run of frames with a missing marker that is interpolated, frames."""
 
 MAX_FIT_RMS_M = 0.03
-"""RMS residual above which markers are swapped or mislabeled, m; soft tissue moves less."""
+"""RMS residual above which markers must be swapped or mislabeled, m, because soft tissue moves
+less.
+"""
 
 
 def visible(x: Array) -> Mask:
-    """Return the rows, last axis of shape (..., k), without NaN, shape (...)."""
+    """Return a mask, shape (...), of the rows without NaN in an array of shape (..., k)."""
     return np.asarray(np.isfinite(x).all(axis=-1), dtype=np.bool_)
 
 
@@ -46,13 +51,13 @@ def rigid_fit(
 
     .. math:: \min_{R,t} \sum_k w_k |R a_k + t - y_k|^2
 
-    by the singular value decomposition of the weighted cross moment (Kabsch 1976), for all frames
-    at once.
+    The solution is the singular value decomposition of the weighted cross moment (Kabsch 1976), for
+    all frames at once.
 
     Parameters
     ----------
     template : ndarray, shape (k, 3) or (m, k, 3)
-        Marker positions on the body, m; the same for all frames or one set per frame.
+        Marker positions on the body, m, either one set for all frames or one set per frame.
     positions : ndarray, shape (m, k, 3)
         Measured marker positions, m; NaN if not visible.
     weights : ndarray, shape (k,), optional
@@ -61,8 +66,8 @@ def rigid_fit(
     Returns
     -------
     q, t, rms : ndarray, shapes (m, 4), (m, 3), (m,)
-        Rotation, image of the origin of the template (m) and RMS residual (m). NaN in frames with
-        fewer than three visible markers, or if all visible markers are on a line.
+        Rotation, measured position of the template's origin (m), and RMS residual (m). They are NaN
+        in frames with fewer than three visible markers, or if all visible markers are on a line.
     """
     seen = visible(positions)
     w = seen * (np.ones(template.shape[-2]) if weights is None else weights)
@@ -73,7 +78,7 @@ def rigid_fit(
     a_mean, y_mean = (np.einsum("mk,mki->mi", w, x) / total for x in (template, y))
     a = template - a_mean[:, None]
 
-    # R = V diag(1, 1, det) U^T of the cross moment, t from the centroids.
+    # R = V diag(1, 1, det) U^T from the cross moment; t is computed from the centroids.
     H = np.einsum("mk,mki,mkj->mij", w, a, y - y_mean[:, None])
     U, _, Vt = np.linalg.svd(H)
     V, Ut = np.swapaxes(Vt, 1, 2), np.swapaxes(U, 1, 2)
@@ -93,10 +98,10 @@ def rigid_fit(
 def steady_fit(template: Array, positions: Array) -> tuple[Array, Array, Array]:
     """Fit like `rigid_fit`, without steps in the pose when single markers disappear or reappear.
 
-    Soft tissue moves every marker some millimeters, so that the pose would step when a marker is
-    hidden. Frames with missing markers are therefore fitted to the marker positions on the body in
-    the nearest complete frames, interpolated in time, if both are at most `MAX_BRIDGE` frames
-    apart.
+    Soft tissue moves every marker some millimeters, so the pose would step when a marker is hidden.
+    A frame with missing markers is therefore fitted to other marker positions on the body. They are
+    interpolated in time between the nearest complete frames, if these are at most `MAX_BRIDGE`
+    frames apart.
     """
     q, t, rms = rigid_fit(template, positions)
     whole = visible(positions).all(axis=1)
@@ -104,13 +109,13 @@ def steady_fit(template: Array, positions: Array) -> tuple[Array, Array, Array]:
     if full.size < 2 or part.size == 0:
         return q, t, rms
 
-    # Complete frames before and after each incomplete one.
+    # Complete frames before and after each incomplete frame.
     i = np.clip(np.searchsorted(full, part), 1, full.size - 1)
     before, after = full[i - 1], full[i]
     near = (before < part) & (part < after) & (after - before <= MAX_BRIDGE)
     part, before, after = part[near], before[near], after[near]
 
-    # Marker positions on the body, interpolated between these frames.
+    # Marker positions on the body, interpolated between the complete frames.
     share = ((part - before) / (after - before))[:, None, None]
     ends = np.concatenate((before, after))
     local = rotation.rotate(
@@ -131,6 +136,6 @@ def _usable(template: Array, seen: Mask) -> Mask:
 
 
 def is_line(points: Array) -> bool:
-    """Return whether points, m, shape (k, 3), are too close to a line for a rotation about it."""
+    """Return whether points, (k, 3), m, are too close to a line to fit a rotation about it."""
     s = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
     return bool(s[1] < max(MIN_WIDTH_M, MIN_WIDTH_SHARE * s[0]))

@@ -26,10 +26,12 @@ if TYPE_CHECKING:
 
 
 FEW_MOVEMENTS = 3
-"""Number of training movements from which the claimed standard deviation is not increased."""
+"""Smallest number of training movements with which the claimed standard deviation is not increased.
+"""
 FEW_MOVEMENTS_FACTOR = 2.5
-"""Factor on the standard deviation with fewer training movements. In measurements, errors on an
-untrained movement were 2.2 to 2.7 times larger than on trained ones."""
+"""Factor of the standard deviation with fewer training movements. In measurements, errors on an
+untrained movement were 2.2 to 2.7 times larger than on trained movements.
+"""
 
 
 class Prediction(NamedTuple):
@@ -38,7 +40,7 @@ class Prediction(NamedTuple):
     q: Quaternion
     """Estimated orientation q_world_segment."""
     sd: float
-    """Standard deviation of the orientation, rad (root mean variance per axis)."""
+    """Standard deviation of the orientation per axis (root mean variance), rad."""
     extrapolating: bool
     """Whether the posture is outside the training range."""
     axis_sd: Vector | None = None
@@ -53,7 +55,7 @@ class SegmentModel(ABC):
     _kinds: ClassVar[dict[str, type[SegmentModel]]] = {}
 
     residual_sd: float
-    """RMS residual per axis on frames outside the fit, rad."""
+    """RMS residual per axis on frames that were not used by the fit, rad."""
 
     @override
     def __init_subclass__(cls) -> None:
@@ -79,17 +81,17 @@ class SegmentModel(ABC):
         """Return the estimate of one frame from plain tuples."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the JSON form, exact also through text."""
+        """Return the JSON form, which is exact even after a conversion to text."""
         return {"kind": self.kind, **fields_form(self)}
 
     @classmethod
     @abstractmethod
     def read(cls, data: Mapping[str, Any]) -> SegmentModel:
-        """Return the model of a JSON form of its own kind."""
+        """Return the model from the JSON form of this class."""
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> SegmentModel:
-        """Return the model of a JSON form of any kind.
+        """Return the model from the JSON form of any model class.
 
         Raises
         ------
@@ -105,10 +107,11 @@ class SegmentModel(ABC):
 
 
 def widen_sd(sd: float, movements: int) -> float:
-    """Return `sd`, increased if few distinct movements were trained."""
+    """Return `sd`, which is increased if the training data contain few distinct movements."""
     return sd if movements >= FEW_MOVEMENTS else sd * FEW_MOVEMENTS_FACTOR
 
 
 UNREFERENCED_SD = radians(10.0)
-"""Standard deviation of a segment without optical reference, rad: the order of the soft-tissue
-artefact on thigh and shank."""
+"""Standard deviation of a segment without optical reference, rad. It is the order of magnitude of
+the soft-tissue artefact on thigh and shank.
+"""

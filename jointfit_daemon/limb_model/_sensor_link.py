@@ -1,21 +1,22 @@
 r"""Expected relation between two sensors of a limb as a function of posture.
 
-Posture is described by gravity alone, so headings and heading drift have no influence. All
-quantities are relative to the static pose, so links stay valid after sensors are re-donned.
+Posture is described by the direction of gravity alone, so headings and heading drift have no
+effect. All quantities are relative to the static pose, so links remain valid after sensors are
+re-donned.
 
-There are two kinds of links. A pair consists of two sensors of one segment; its quantity is the
-rotation :math:`d = \log(q_a^* q_b)`. A joint consists of two sensors of neighboring segments; its
-quantity is the angle about the vertical between their flexion axes, which on a hinge is small and
-depends on posture. Both quantities are linear in ten polynomials :math:`\phi` of the tilts of the
-two segments, :math:`d = W\phi`. Within the range of the movement the standard deviation of a
-component is the residual :math:`\sigma_0` of the movement, beyond it
+There are two kinds of links. A *pair* link relates two sensors of one segment. It predicts the
+rotation :math:`d = \log(q_a^* q_b)`. A *joint* link relates two sensors of neighboring segments. It
+predicts the angle d about the vertical between their flexion axes, which on a hinge is small and
+depends on posture. d is linear in ten polynomials :math:`\phi` of the tilts of the two segments,
+:math:`d = W\phi`. Within the range of the movement the standard deviation of a component is the
+residual :math:`\sigma_0` of the movement. Beyond the range it is
 
 .. math::
 
     \sigma^2 = \sigma_0^2 + \lVert U \phi \rVert^2 + \lVert W (\phi - \phi_0) \rVert^2 / c
 
-with the covariance :math:`U^\mathsf{T} U` of the weights, the nearest posture :math:`\phi_0` within
-the range, for which d is computed, and the number c of components.
+where :math:`U^\mathsf{T} U` is the covariance of the weights, :math:`\phi_0` the nearest posture
+within the range, for which d is computed, and c the number of components.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 LinkKind = Literal["pair", "joint"]
 
 LEAST_LEVEL = 0.5
-"""Smallest squared horizontal part of a flexion axis for which its heading is defined."""
+"""Smallest squared horizontal component of a flexion axis with which its heading is defined."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +45,9 @@ class SensorLink:
     b: str
     kind: LinkKind
     near: tuple[str, ...]
-    """Sensors whose tilt, with that of `a`, describes the posture; the first available one is
-    used."""
+    """Sensors of the neighboring segment. The tilt of the first available sensor and the tilt of
+    `a` describe the posture.
+    """
     weights: tuple[tuple[float, ...], ...]
     """Ten weights for each predicted component (3 for a pair, 1 for a joint)."""
     low: tuple[float, ...]
@@ -55,11 +57,13 @@ class SensorLink:
     spread: float
     """RMS residual per component on held-out frames, rad."""
     total: float
-    """RMS per component of the predicted quantity itself, rad: the residual without a known
-    posture."""
+    """RMS per component of the predicted quantity, rad. It is the residual if the posture is
+    unknown.
+    """
     uncertainty: tuple[tuple[float, ...], ...] = ()
-    """U, a factor of the covariance of the weights of a component, shape (10, 10), rad; empty
-    without training."""
+    """Factor U of the covariance of the weights of a component, rad, shape (10, 10); empty without
+    training.
+    """
 
     def expected(self, up_a: Vector, up_near: Vector | None) -> tuple[tuple[float, ...], float]:
         """Return the expected components in a posture and their standard deviation, rad.
@@ -74,7 +78,8 @@ class SensorLink:
         posture = posture_one(up_a, up_near)
         variance = self.spread * self.spread
 
-        # The quantity is not extrapolated; what the weights would add is counted as uncertain.
+        # The quantity is not extrapolated. The change by an extrapolation is added to the
+        # uncertainty.
         kept = posture
         if not (all(map(le, self.low, posture)) and all(map(le, posture, self.high))):
             kept = tuple(map(min, map(max, posture, self.low), self.high))
@@ -88,7 +93,7 @@ class SensorLink:
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> SensorLink:
-        """Return the link of a JSON form."""
+        """Return the link from its JSON form."""
         return SensorLink(
             a=data["a"],
             b=data["b"],
@@ -113,7 +118,7 @@ def up_one(q: Quaternion) -> Vector:
 
 
 def posture_one(u: Vector, v: Vector) -> tuple[float, ...]:
-    """Return ten polynomials of two tilts, all 0 if both segments are upright."""
+    """Return ten polynomials of two tilts, which are all 0 if both segments are upright."""
     ux, uy, uz = u
     vx, vy, vz = v
     return (
@@ -125,7 +130,7 @@ def posture_one(u: Vector, v: Vector) -> tuple[float, ...]:
 def axis_heading_one(a: Quaternion, b: Quaternion) -> float | None:
     """Return the heading of the flexion axis (x) of b relative to the flexion axis of a, rad.
 
-    None if either axis is too steep for a heading.
+    The result is None if either axis is too steep for a heading.
     """
     ax, ay = level_axis(a)
     bx, by = level_axis(b)

@@ -1,7 +1,7 @@
 """Weighted mean of several orientations of one segment.
 
-The mean is the eigenvector mean of Markley et al. 2007. This mean does not depend on quaternion
-signs and is equivariant to any rotation of the world.
+The mean is the eigenvector mean of Markley et al. 2007. It does not depend on quaternion signs. If
+the world is rotated, the mean rotates with it.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def fuse(sensors: Sequence[Array], weights: Sequence[float]) -> Array:
         mean[finite] = rotation.average(stacked, np.broadcast_to(weights, stacked.shape[:2]))
         return mean
 
-    # Two sensors: the closed form of `fuse_one`, for all frames.
+    # Two sensors have the closed form of `fuse_one`, here for all frames.
     first, second = sensors
     w1, w2 = weights
     d = np.sum(first * second, axis=1)
@@ -54,15 +54,15 @@ def fuse(sensors: Sequence[Array], weights: Sequence[float]) -> Array:
 
 
 def fuse_one(sensors: Sequence[Quaternion], weights: Sequence[float]) -> Quaternion:
-    r"""Return the weighted mean of one frame; closed form for two sensors.
+    r"""Return the weighted mean of one frame, in closed form for two sensors.
 
     .. math:: q = \sqrt{\tfrac{\omega_1(\omega_1 - \omega_2 + z)}{z(\omega_1 + \omega_2 + z)}} q_1
               + \mathrm{sign}(d) \sqrt{\tfrac{\omega_2(\omega_2 - \omega_1 + z)}
               {z(\omega_1 + \omega_2 + z)}} q_2,
               \quad z = \sqrt{(\omega_1 - \omega_2)^2 + 4 \omega_1 \omega_2 d^2}
 
-    with d the scalar product of the two quaternions (Markley et al. 2007, eq. 19). For more sensors
-    the eigenvector is computed.
+    where d is the scalar product of the two quaternions (Markley et al. 2007, eq. 19). For more
+    sensors the eigenvector is computed.
     """
     if len(sensors) == 1:
         return normalize_one(sensors[0])

@@ -1,6 +1,7 @@
-"""The physical test: three rotations by hand show whether a sensor's frames are as configured.
+"""Physical test of a sensor: three rotations by hand show whether its frames are as configured.
 
-Invariant: pure. A test depends on its chunks only, live and recorded.
+Invariant: the result of a test depends only on the received chunks. Live and recorded tests of the
+same chunks have the same result.
 """
 
 from jointfit_daemon.physical_test._frame_judgement import explain_frames, fit_frames

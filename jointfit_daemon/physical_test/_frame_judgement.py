@@ -1,19 +1,20 @@
-"""Judges world, axes and direction of quaternions by three rotations of known axes. Pure.
+"""Check of world, axes and direction of quaternions, by three rotations about known axes.
 
-A sensor at rest, its z axis up, is turned three times by a quarter turn:
+A sensor at rest with its z axis up is rotated three times by 90 degrees:
 
 1. about the vertical, counter-clockwise seen from above;
 2. about its own x axis, so that its y axis points up;
 3. about the vertical again, counter-clockwise.
 
-With ``q_k`` the orientation after rotation k, ``q_1 q_0*`` and ``q_3 q_2*`` must be +90 degrees
-about z in the world, and ``q_1* q_2`` +90 degrees about x in the sensor. Together they determine
-all but the heading: an inverse quaternion exchanges world and sensor, in which the axes of
-rotations 1 and 3 are at a right angle instead of equal.
+Let ``q_k`` be the orientation after rotation k. ``q_1 q_0*`` and ``q_3 q_2*`` must be +90 degrees
+about z in the world, and ``q_1* q_2`` must be +90 degrees about x in the sensor. Together the
+rotations determine the convention except for the heading. An inverse quaternion is also detected.
+It exchanges world and sensor; in sensor axes, the axes of rotations 1 and 3 are perpendicular
+instead of equal.
 
-Exchanged components and wrong signs are an orthogonal transformation of q. This transformation
-always equals rotations of world and sensor, applied to q or to its inverse. Of several explanations
-the simplest is given.
+Exchanged components and wrong signs are an orthogonal transformation of q. Such a transformation is
+always equivalent to rotations of world and sensor that are applied to q or to its inverse. If
+several explanations exist, the simplest is returned.
 """
 
 from __future__ import annotations
@@ -30,8 +31,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 TOLERANCE_RAD = radians(25.0)
-"""Largest deviation from a quarter turn that a hand makes, rad; another convention deviates by 90
-degrees or more."""
+"""Largest plausible deviation of a manual rotation from 90 degrees, rad. With another convention
+the deviation is 90 degrees or more.
+"""
 _QUARTER = rotation.exp(0.5 * np.pi * np.eye(3)[[2, 0, 2]])
 _ORDERS = {"w x y z": (0, 1, 2, 3), "x y z w": (3, 0, 1, 2)}
 """Index of w, x, y and z among the received components."""
@@ -41,24 +43,25 @@ _PRINTED = "x is +x, y is +y, z is +z"
 
 @dataclass(frozen=True, slots=True)
 class FrameFit:
-    """How well poses at rest agree with the three rotations."""
+    """Agreement of poses at rest with the three rotations."""
 
     deviations_rad: tuple[float, float, float]
-    """Angle between measured and expected change of each rotation, rad."""
+    """Angle between measured and expected rotation, for each rotation, rad."""
 
     @property
     def agrees(self) -> bool:
-        """Whether all rotations were measured as they were made."""
+        """Whether all measured rotations agree with the expected rotations."""
         return all(angle <= TOLERANCE_RAD for angle in self.deviations_rad)
 
 
 def fit_frames(rests: Array) -> FrameFit:
-    """Compare four poses with the expected changes.
+    """Compare the rotations between four poses with the expected rotations.
 
     Parameters
     ----------
     rests : ndarray, shape (4, 4)
-        Canonical orientations q_world_sensor at rest, before the first rotation and after each.
+        Canonical orientations q_world_sensor at rest, before the first rotation and after each
+        rotation.
     """
     back = rotation.conjugate(rests)
     changes = np.stack(
@@ -73,15 +76,15 @@ def fit_frames(rests: Array) -> FrameFit:
 
 
 def explain_frames(received: Array) -> str:
-    """Return in words which convention explains the received quaternions.
+    """Return a text on the convention that explains the received quaternions.
 
-    Order of the components, direction, axes of world and sensor are determined from the rotations,
-    each by the nearest axis.
+    The rotations determine the order of the components, the direction, and the axes of world and
+    sensor. Each axis is rounded to the nearest coordinate axis.
 
     Parameters
     ----------
     received : ndarray, shape (4, 4)
-        Quaternions as received, at rest, before the first rotation and after each.
+        Quaternions as received at rest, before the first rotation and after each rotation.
     """
     explanations: list[tuple[int, str]] = []
     for order, index in _ORDERS.items():
@@ -114,7 +117,7 @@ def explain_frames(received: Array) -> str:
 def _find_axes(q: Array) -> tuple[str, str] | None:
     """Return the vertical axis of the world and the printed axes, each as the nearest axis.
 
-    None if the rotations are not quarter turns, or their axes do not agree.
+    The result is None if the rotations are not about 90 degrees, or their axes do not agree.
     """
     back = rotation.conjugate(q)
     world = rotation.log(rotation.multiply(q[1:], back[:-1]))
@@ -123,7 +126,7 @@ def _find_axes(q: Array) -> tuple[str, str] | None:
     if np.abs(turned - 0.5 * np.pi).max() > TOLERANCE_RAD:
         return None
 
-    # Rotations 1 and 3 are about the vertical, so their axes in the world are equal.
+    # Rotations 1 and 3 are about the vertical, so their axes in the world must be equal.
     up, up_again = world[0] / turned[0], world[2] / turned[2]
     if np.arccos(np.clip(up @ up_again, -1.0, 1.0)) > TOLERANCE_RAD:
         return None

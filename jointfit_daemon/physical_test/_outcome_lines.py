@@ -1,4 +1,4 @@
-"""The outcome of a physical test in words, the same in the terminal and in the dashboard."""
+"""Outcome of a physical test as text, which is the same in the terminal and in the dashboard."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ROTATIONS = ("about the vertical", "about its x axis", "about the vertical, tipp
 
 
 def correction_lines(result: PhysicalTestResult) -> Iterator[str]:
-    """Yield the outcome, and the lines of rig.toml that correct the reading."""
+    """Yield the outcome and, if needed, the lines of rig.toml that correct the orientations."""
     if result.agrees:
         yield f"{result.id}: world, axes and direction are as configured"
         return

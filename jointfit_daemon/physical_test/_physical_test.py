@@ -1,7 +1,7 @@
-"""One physical test: steps, rests that end the steps, and settings that agree with the test.
+"""Physical test of one sensor: steps, rests that end the steps, and settings that fit the test.
 
-The chunks are stored, so that other values of the keys `direction` and `world` are tried on the
-same movement.
+The chunks are stored, so that other values of the keys `direction` and `world` can be tried with
+the same movement.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ STEPS = (
     "Tip it by a quarter turn about its x axis, so that its y axis points up, and hold it still.",
     "Turn it, as it stands, by a quarter turn, counter-clockwise seen from above.",
 )
-"""Instructions; the sensor rests after each."""
+"""Instructions for the user. The sensor must be at rest after each step."""
 _KEYS = ("direction", "world")
-"""Keys of a driver that change how quaternions are read."""
+"""Keys of a driver that change the interpretation of quaternions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,16 +45,17 @@ class PhysicalTestResult:
     deviations_deg: tuple[float, float, float]
     """Deviation of each measured rotation from the requested rotation, deg."""
     found: str
-    """Convention of the quaternions as received, in words."""
+    """Text that describes the convention of the received quaternions."""
     rig_toml: tuple[str, ...]
-    """Keys of its ``[[imu]]`` table that correct the reading; empty if none is needed or none
-    does."""
+    """Keys of the ``[[imu]]`` table that correct the orientations. Empty if no correction is needed
+    or none exists.
+    """
     alternatives: tuple[str, ...]
-    """Other corrections that fit equally: they differ by the heading only."""
+    """Other corrections that fit equally well and differ only by the heading."""
 
 
 class PhysicalTest:
-    """One test of one sensor, from its chunks.
+    """Test of one sensor, which processes the chunks of the sensor.
 
     Parameters
     ----------
@@ -65,7 +66,7 @@ class PhysicalTest:
     def __init__(self, source: Source) -> None:
         self.source = source
         self.rests: list[tuple[int, int]] = []
-        """Begin and end of each rest, ns; one for each step that ended."""
+        """Begin and end of each rest, ns, with one rest for each completed step."""
         self.has_orientation = False
         """Whether the sensor has sent an orientation."""
         self._decoder = source.driver_class(source.settings).decoder()
@@ -74,16 +75,16 @@ class PhysicalTest:
 
     @property
     def instruction(self) -> str | None:
-        """Instruction of the present step; None after the last step."""
+        """Instruction of the current step; None after the last step."""
         done = len(self.rests)
         return STEPS[done].format(id=self.source.id) if done < len(STEPS) else None
 
     def begin(self) -> None:
-        """Accept rests from now on: rests before the first instruction do not count."""
+        """Start to accept rests, because rests before the first instruction do not count."""
         self._finder = RestFinder()
 
     def add(self, chunk: Chunk) -> None:
-        """Add a chunk of the sensor; a rest within the chunk ends the present step."""
+        """Add a chunk of the sensor; a rest within the chunk ends the current step."""
         if len(self.rests) == len(STEPS):
             return
         self._chunks.append(chunk)
@@ -98,21 +99,21 @@ class PhysicalTest:
                 self.rests.append(rest)
 
     def result(self) -> PhysicalTestResult:
-        """Evaluate the complete test; this method decodes all chunks several times."""
+        """Evaluate the complete test, which decodes all chunks several times."""
         return judge_recording(self.source, self._chunks, self.rests)
 
 
 def judge_recording(
     source: Source, chunks: Sequence[Chunk], rests: Sequence[tuple[int, int]]
 ) -> PhysicalTestResult:
-    """Evaluate a recorded test, and find the settings that agree with the test.
+    """Evaluate a recorded test, and find the settings that fit the test.
 
     Parameters
     ----------
     source
         Sensor of a rig.
     chunks
-        All its chunks, in order.
+        All chunks of the sensor, in order.
     rests
         Begin and end of each rest, ns.
     """
@@ -136,7 +137,7 @@ def judge_recording(
 
 
 def _other_settings(settings: Any) -> list[dict[str, str]]:
-    """Return other values of the keys for frames, those with the fewest changes first."""
+    """Return other values of `_KEYS`, in order of the number of changed keys."""
     fields = type(settings).model_fields
     choices = {key: get_args(fields[key].annotation) for key in _KEYS if key in fields}
     all_values = [dict(zip(choices, values, strict=True)) for values in product(*choices.values())]
@@ -150,7 +151,7 @@ def _other_settings(settings: Any) -> list[dict[str, str]]:
 def _poses(
     source: Source, settings: Any, chunks: Sequence[Chunk], rests: Sequence[tuple[int, int]]
 ) -> tuple[Array, Array]:
-    """Return mean canonical and mean received quaternions at rest, each of shape (4, 4)."""
+    """Return the mean canonical and mean received quaternions of the rests, (4, 4) each."""
     decoder = source.driver_class(settings).decoder()
     canonical: list[list[Quaternion]] = [[] for _ in rests]
     received: list[list[Quaternion]] = [[] for _ in rests]

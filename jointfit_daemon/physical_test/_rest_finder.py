@@ -1,4 +1,4 @@
-"""Finds the poses at rest in a stream of orientations. Pure; no clock is read."""
+"""Detection of the poses at rest in a stream of orientations. No clock is read."""
 
 from __future__ import annotations
 
@@ -14,19 +14,20 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion
 
 REST_S = 1.0
-"""Duration of stillness that makes a rest, s."""
+"""Shortest duration of a rest, s."""
 STILL_RAD = radians(1.5)
-"""Largest deviation from the mean orientation during a rest, rad. Filters of devices settle more
-slowly than the hand."""
+"""Largest deviation from the mean orientation during a rest, rad. After a movement the orientation
+filter of a device settles more slowly than the hand.
+"""
 MOVED_RAD = radians(45.0)
-"""Smallest rotation between two rests, rad: a pause on the way is not a rest."""
+"""Smallest rotation between two rests, rad, so that a pause during the movement is not a rest."""
 _FEWEST = 5
-"""Samples that a rest needs."""
+"""Smallest number of samples in a rest."""
 _NS = 1_000_000_000
 
 
 class RestFinder:
-    """Reports a rest once the sensor lies still, away from the rest before."""
+    """Detects when the sensor is at rest in an orientation far from the previous rest."""
 
     def __init__(self) -> None:
         self._recent: deque[tuple[int, Quaternion]] = deque()
@@ -38,9 +39,9 @@ class RestFinder:
         Parameters
         ----------
         t_ns
-            Time of the sample, in order, ns.
+            Time of the sample, ns; must increase from call to call.
         q_world_sensor
-            Unit quaternion in any fixed convention: only angles between samples are used.
+            Unit quaternion in any fixed convention, because only angles between samples are used.
         """
         recent = self._recent
         recent.append((t_ns, q_world_sensor))

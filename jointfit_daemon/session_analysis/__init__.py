@@ -1,4 +1,4 @@
-"""Quantities of a whole session: gait cycles, range of motion, differences from cameras, gaps."""
+"""Quantities of a whole session: gait cycles, ranges of motion, camera differences and gaps."""
 
 from jointfit_daemon.session_analysis._gait import (
     LEAST_CYCLES,

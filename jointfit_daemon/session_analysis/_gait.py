@@ -3,11 +3,11 @@ r"""Gait cycles of a leg from the orientation of its shank.
 Mid-swing is the peak of the sagittal angular velocity of the shank (Aminian et al. 2002; Salarian
 et al. 2004). Initial contact is the end of the forward rotation after mid-swing. At this instant
 the shank reaches its largest forward inclination and the foot is farthest in front of the body.
-Zeni et al. (2008) detect the same instant from markers. A cycle extends from one initial contact to
+Zeni et al. (2008) detect the same instant with markers. A cycle extends from one initial contact to
 the next.
 
 Invariant: cycles do not overlap, contain no gap of the series, and belong to a run of at least
-`LEAST_CYCLES`; movement that is not walking yields no cycle, but a reason.
+`LEAST_CYCLES`. If the movement is not walking, the result contains a reason instead of cycles.
 """
 
 from __future__ import annotations
@@ -35,12 +35,13 @@ if TYPE_CHECKING:
 LEAST_CYCLES = 3
 """Smallest number of successive cycles that count as walking."""
 SWING_RATE = np.radians(100.0)
-"""Smallest angular velocity of the shank at mid-swing, rad/s; walking reaches 200 to 450 deg/s."""
+"""Smallest angular velocity of the shank at mid-swing, rad/s. Walking reaches 200 to 450 deg/s."""
 SHORTEST_S, LONGEST_S = 0.6, 2.5
 """Limits of the duration of a cycle, s."""
 SWING_SHARE = (0.15, 0.44)
-"""Limits of the share of a cycle in which the shank rotates forward. The share is about 0.3 in
-walking and 0.5 in a pendulum."""
+"""Limits of the fraction of a cycle in which the shank rotates forward. The fraction is about 0.3
+in walking and 0.5 in the motion of a pendulum.
+"""
 LEAST_RANGE = np.radians(30.0)
 """Smallest range of the inclination of the shank within a cycle, rad."""
 SAME_PACE = 0.3
@@ -71,7 +72,7 @@ class GaitCycles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CycleCurves:
-    """A quantity over the gait cycle, with one row for each cycle."""
+    """Values of a quantity over the gait cycle, with one row for each cycle."""
 
     percent: Array
     """Instants, percent of the cycle, shape (m,)."""
@@ -128,7 +129,7 @@ def find_gait_cycles(shank: SegmentSeries) -> GaitCycles:
 
 
 def _sagittal_rates(shank: SegmentSeries) -> Iterator[tuple[Array, Array]]:
-    """Yield times and filtered forward rotation of the shank, rad/s, of each part without a gap."""
+    """Yield times and filtered forward rotation rate of the shank, rad/s, for each gapless part."""
     if len(shank.t_s) < 2:  # noqa: PLR2004 - a rate needs two rows
         return
     rate_hz = min(sample_rate_hz(shank.t_s), _GRID_HZ)
@@ -164,7 +165,7 @@ def _candidates(times: Array, rates: Array) -> Iterator[tuple[float, float]]:
 
 
 def _objection(times: Array, rates: Array, cycle: tuple[float, float]) -> str | None:
-    """Return why an interval is not a cycle of walking; None for a walking cycle."""
+    """Return the reason why an interval is not a cycle of walking, or None if it is."""
     start, end = cycle
     if not SHORTEST_S <= end - start <= LONGEST_S:
         return (
@@ -201,7 +202,7 @@ def _regular_runs(candidates: list[tuple[float, float]]) -> list[tuple[float, fl
 
 
 def normalize_cycles(t_s: Array, values: Array, cycles_s: Array, points: int = 101) -> CycleCurves:
-    """Interpolate a series to 0 to 100 % of each cycle; cycles with unknown values are left out.
+    """Interpolate a series at 0 to 100 % of each cycle, without cycles with unknown values.
 
     Parameters
     ----------
@@ -210,7 +211,7 @@ def normalize_cycles(t_s: Array, values: Array, cycles_s: Array, points: int = 1
     cycles_s : ndarray, shape (k, 2)
         Start and end of each cycle, s.
     points : int
-        Number of instants of a cycle.
+        Number of instants per cycle.
     """
     share = np.linspace(0.0, 1.0, points)
     at_s = cycles_s[:, :1] + share * (cycles_s[:, 1:] - cycles_s[:, :1])

@@ -1,4 +1,4 @@
-"""Range of motion, differences between two measurements of an angle, gaps of a series."""
+"""Range of motion, differences between two measurements of an angle, and gaps of a series."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ if TYPE_CHECKING:
     from jointfit_daemon.session_data import JointSeries
 
 QUANTILE_95 = 1.959963984540054
-"""Half width of the 95 % interval of a normal distribution, standard deviations."""
+"""Half width of the 95 % interval of a normal distribution, in standard deviations."""
 _LEAST_GAP_S = 0.05
-"""Shortest interval without samples that is a gap, s. A delay of some samples is no gap."""
+"""Shortest interval without samples that counts as a gap, s. A delay of some samples is not a gap.
+"""
 _LEAST_GAP_PERIODS = 3.0
-"""Shortest interval without samples that is a gap, sample periods."""
+"""Shortest interval without samples that counts as a gap, in sample periods."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,15 +34,15 @@ class MotionRange:
     maximum: float
     median: float
     low: float
-    """Limit below which 2.5 % of the values are."""
+    """Quantile 0.025 of the values."""
     high: float
-    """Limit above which 2.5 % of the values are."""
+    """Quantile 0.975 of the values."""
     minimum_sd: float
     """Standard deviation at the minimum; NaN if unknown."""
     maximum_sd: float
     """Standard deviation at the maximum; NaN if unknown."""
     known_share: float
-    """Share of the instants at which the angle is known."""
+    """Fraction of the instants at which the angle is known."""
 
     @property
     def extent(self) -> float:
@@ -72,14 +73,14 @@ def motion_range(joint: JointSeries, angle: str) -> MotionRange | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AngleDifference:
-    """Difference between an angle from the sensors and from the cameras (Bland and Altman 1986)."""
+    """Difference between the sensor and camera values of an angle (Bland and Altman 1986)."""
 
     joint: str
     angle: str
     t_s: Array
-    """Instants of the cameras at which both angles are known, s, shape (n,)."""
+    """Instants of camera frames at which both angles are known, s, shape (n,)."""
     difference: Array
-    """Sensor angle minus camera angle, wrapped to half a turn, rad, shape (n,)."""
+    """Sensor angle minus camera angle, wrapped to ±π, rad, shape (n,)."""
     mean: Array
     """Mean of sensor angle and camera angle, rad, shape (n,)."""
     bias: float
@@ -91,19 +92,20 @@ class AngleDifference:
     worst: float
     """Largest absolute difference, rad."""
     coverage: float
-    """Share of `difference` within the 95 % interval of the sensors' standard deviation; NaN
-    without a standard deviation."""
+    """Fraction of `difference` within the 95 % interval from the standard deviation of the sensor
+    angle; NaN if this standard deviation is unknown.
+    """
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Limits of agreement, rad: 95 % of normally distributed differences are between them."""
+        """Limits of agreement, rad, which contain 95 % of normally distributed differences."""
         return self.bias - QUANTILE_95 * self.sd, self.bias + QUANTILE_95 * self.sd
 
 
 def angle_difference(
     sensors: JointSeries, cameras: JointSeries, angle: str
 ) -> AngleDifference | None:
-    """Compare an angle at the instants of the cameras; None without common instants."""
+    """Compare an angle at the instants of camera frames; None without common instants."""
     own = interpolate_values(sensors.t_s, sensors.angles[angle], cameras.t_s)
     reference = cameras.angles[angle]
     difference = np.mod(own - reference + np.pi, 2.0 * np.pi) - np.pi
@@ -139,9 +141,9 @@ class SeriesQuality:
 
     count: int
     rate_hz: float
-    """Rate: one over the median interval, Hz; NaN for less than two rows."""
+    """Rate, Hz, the inverse of the median interval; NaN for less than two rows."""
     lost_share: float
-    """Share of the expected samples between the first and the last row that is missing."""
+    """Fraction of the expected samples between the first and the last row that is missing."""
     gaps_s: Array
     """Start and end of each interval without samples, s, shape (n, 2)."""
 

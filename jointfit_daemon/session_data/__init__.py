@@ -1,7 +1,8 @@
-"""A recorded session as arrays, independent of file formats, for files, replay and reports.
+"""Recorded session as arrays, independent of file formats, for files, replay and reports.
 
-Every series has its own times, seconds since the start of the session. CONVENTIONS.md defines world
-and segment axes; the optical world differs from the world of the sensors by a heading.
+Every series has its own times in seconds since the start of the session. CONVENTIONS.md defines
+world and segment axes. The optical world and the world of the sensors differ by a rotation about
+the vertical.
 """
 
 from jointfit_daemon.session_data._resampling import (

@@ -1,7 +1,7 @@
-"""Time axes of series: rate, uniformity, and interpolation of values at other instants.
+"""Time axes of series, their rate and uniformity, and interpolation at other instants.
 
-Gaps are not bridged: an interpolated row between two rows that are further apart than
-`MAX_GAP_SAMPLES` periods, or next to an unknown row, is unknown.
+Gaps are not bridged. An interpolated row is unknown if its two neighbors are more than
+`MAX_GAP_SAMPLES` periods apart, or if one of them is unknown.
 """
 
 from __future__ import annotations
@@ -25,14 +25,15 @@ sample is bridged."""
 UNIFORM_SHARE = 0.01
 """Largest deviation of an instant from a uniform time axis, in sample periods."""
 _EXACT_SHARE = 1e-6
-"""Largest time to a row, in sample periods, at which an instant gets the value of the row without
-interpolation."""
+"""Largest distance to a row, in sample periods, at which an instant has the value of this row
+without interpolation.
+"""
 
 
 def sample_rate_hz(t_s: Array) -> float:
-    """Return the rate, Hz, of instants, s, shape (n,): one over the median interval.
+    """Return the rate, Hz, of instants, s, shape (n,), which is the inverse of the median interval.
 
-    NaN for less than two instants.
+    The result is NaN for less than two instants.
     """
     return 1.0 / float(np.median(np.diff(t_s))) if len(t_s) > 1 else float("nan")
 
@@ -49,8 +50,9 @@ def is_uniform(t_s: Array) -> bool:
 def uniform_times(axes: Sequence[Array]) -> Array:
     """Return a uniform time axis for several series at their highest rate, s, shape (n,).
 
-    If all series share a uniform axis, this axis is returned. Otherwise instants are whole numbers
-    of periods from the first row of the fastest series, over the range of all series.
+    If all series have the same uniform axis, this axis is returned. Otherwise the axis contains the
+    first row of the series with the highest rate, has the period of this series, and extends over
+    the range of all series.
     """
     filled = [t_s for t_s in axes if len(t_s)]
     if not filled:
@@ -59,7 +61,7 @@ def uniform_times(axes: Sequence[Array]) -> Array:
     if is_uniform(first) and all(np.array_equal(t_s, first) for t_s in filled):
         return first
 
-    # Among equally fast series, use the first one: their periods differ only by rounding.
+    # Among series of equal rate the first is used, because their periods differ only by rounding.
     shortest = min(map(_period, filled))
     fastest = next(t_s for t_s in filled if _period(t_s) <= shortest * (1.0 + UNIFORM_SHARE))
     period = _period(fastest)
@@ -81,7 +83,7 @@ def _period(t_s: Array) -> float:
 
 
 def rows_on_axis(t_s: Array, axis_s: Array) -> NDArray[np.intp] | None:
-    """Return the row of a uniform axis for every instant; None if any is between two rows.
+    """Return the row of a uniform axis for every instant; None if any instant is between rows.
 
     Parameters
     ----------
@@ -102,12 +104,12 @@ def rows_on_axis(t_s: Array, axis_s: Array) -> NDArray[np.intp] | None:
 
 
 def interpolate_values(t_s: Array, values: Array, at_s: Array) -> Array:
-    """Interpolate linearly; shape (n, ...) to (m, ...), NaN outside and inside gaps."""
+    """Interpolate linearly from shape (n, ...) to (m, ...), with NaN outside and inside gaps."""
     i, j, share = _neighbours(t_s, at_s)
     if not len(t_s):
         return np.full((len(at_s), *values.shape[1:]), np.nan)
     share = share.reshape(-1, *([1] * (values.ndim - 1)))
-    # At the instant of a row, use the row without the next row, because 0 times NaN is NaN.
+    # At the instant of a row the next row is not used, because 0 times NaN is NaN.
     between: Array = np.where(
         share == 0.0, values[i], (1.0 - share) * values[i] + share * values[j]
     )
@@ -115,10 +117,10 @@ def interpolate_values(t_s: Array, values: Array, at_s: Array) -> Array:
 
 
 def interpolate_orientations(t_s: Array, q: Array, at_s: Array) -> Array:
-    """Interpolate along the shortest rotation; shape (n, 4) to (m, 4), NaN as `interpolate_values`.
+    """Interpolate rotations from shape (n, 4) to (m, 4), with NaN as in `interpolate_values`.
 
-    The result is the spherical linear interpolation q_i exp(a log(q_i* q_i+1)). It is the value
-    between rows i and i + 1, at the share a of their interval.
+    The result is the spherical linear interpolation q_i exp(a log(q_i* q_i+1)) along the shortest
+    rotation. a is the position between rows i and i + 1, from 0 to 1.
     """
     i, j, share = _neighbours(t_s, at_s)
     if not len(t_s):
@@ -129,7 +131,7 @@ def interpolate_orientations(t_s: Array, q: Array, at_s: Array) -> Array:
 
 
 def _neighbours(t_s: Array, at_s: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
-    """Return the rows before and after each instant, and the share between them, NaN in gaps."""
+    """Return the rows before and after each instant, and its position between them; NaN in gaps."""
     if not len(t_s):
         none = np.zeros(len(at_s), dtype=np.intp)
         return none, none, np.full(len(at_s), np.nan)

@@ -1,7 +1,7 @@
 """Series of one session: sensors, markers, segments, joints, and events on the same time line.
 
-Invariant: the arrays of a series have as many rows as it has times; times are finite and strictly
-increasing; a quaternion is of unit length or NaN in all components.
+Invariant: all arrays of a series have one row for each time. Times are finite and strictly
+increasing. A quaternion has unit length, or all its components are NaN.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class SensorSeries:
     angular_velocity: Array | None = None
     """Angular rate in sensor axes, rad/s, shape (n, 3)."""
     acceleration: Array | None = None
-    """Specific force in sensor axes, m/s^2, shape (n, 3); at rest +9.81 upward."""
+    """Specific force in sensor axes, m/s^2, shape (n, 3). At rest it is 9.81 m/s^2 upward."""
     magnetic_field: Array | None = None
     """Magnetic field in sensor axes, in the unit of the sensor, shape (n, 3)."""
 
@@ -122,17 +122,17 @@ class JointSeries:
 
 @dataclass(frozen=True, slots=True)
 class TimelineEvent:
-    """Event at an instant: a mark, a phase, a fault or a gap."""
+    """Event at an instant, such as a mark, a phase, a fault or a gap."""
 
     t_s: float
     """Instant since the start of the session, s."""
     kind: str
-    """Kind in one word: ``mark``, ``phase``, ``device`` ..."""
+    """Kind of the event in one word, such as ``mark``, ``phase`` or ``device``."""
     id: str = ""
     """Sensor, segment or phase to which the event belongs; empty for the whole session."""
     text: str = ""
     data: Mapping[str, object] = field(default_factory=dict)
-    """Further values of the event, of JSON types."""
+    """Further values of the event, which have JSON types."""
 
 
 def _check_times(owner: str, t_s: Array) -> None:

@@ -1,4 +1,4 @@
-"""A session: all its series, its start, and its events."""
+"""Session with all its series, its start and its events."""
 
 from __future__ import annotations
 
