@@ -1,4 +1,4 @@
-"""Wire formats without I/O: codecs for drivers and simulators, one package per family."""
+"""Wire formats without I/O: codecs for drivers and simulators, one package per device family."""
 
 from jointfit_variant import select_variant
 

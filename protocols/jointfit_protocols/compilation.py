@@ -1,7 +1,7 @@
-"""Options for mypyc, in modules that it may compile.
+"""Options for the compiler mypyc, in modules that it may compile.
 
-mypyc reads the decorators of mypy_extensions in the source and never runs them, so that an
-installation does not need the package. This module itself is not compiled: mypyc regards its second
+mypyc reads the decorators of mypy_extensions in the source and never runs them, so an installation
+does not need this package. This module itself is not compiled, because mypyc regards its second
 branch as unreachable.
 """
 

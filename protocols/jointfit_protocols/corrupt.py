@@ -1,6 +1,7 @@
-"""Report of every codec about bytes that contain no message.
+"""Report of a codec about bytes that contain no message.
 
-Invariant: a codec never raises on input. Corruption is a value with its number of bytes and reason.
+Invariant: a codec never raises an exception because of its input. It reports corruption as a value
+with a number of bytes and a reason.
 """
 
 from __future__ import annotations
@@ -14,23 +15,24 @@ CUT_OFF = "cut off"
 
 @final
 class CorruptBytes(NamedTuple):
-    """A run of input without a message."""
+    """A run of consecutive input bytes that contain no message."""
 
     discarded: int
-    """Discarded bytes."""
+    """Number of discarded bytes."""
     reason: str
-    """Reason, in a few words."""
+    """Short reason why the bytes were discarded."""
 
 
 class CorruptRun:
-    """Joins bytes without a message to runs.
+    """Combines consecutive bytes without a message to runs.
 
     Parameters
     ----------
     longest : int
-        Bytes after which a run is reported, so that the sum of corrupt bytes is up to date.
+        Number of bytes after which a run is reported, so that the count of corrupt bytes is
+        current.
     no_start : str
-        Reason of bytes outside all candidates.
+        Reason that is reported for bytes outside of all possible messages.
     """
 
     def __init__(self, longest: int, no_start: str = NO_START) -> None:
@@ -43,7 +45,10 @@ class CorruptRun:
         """Total length of all runs so far, bytes."""
 
     def add(self, count: int, reason: str, found: list[Any]) -> None:
-        """Add bytes; the first fault inside a candidate names the run."""
+        """Add bytes to the run.
+
+        The first fault inside a possible message becomes the reason of the run.
+        """
         self.discarded += count
         if self.count == 0 or self._reason == self._no_start:
             self._reason = reason
@@ -54,7 +59,7 @@ class CorruptRun:
             self._reason = reason
 
     def end(self, found: list[Any]) -> None:
-        """Report the run, if there is one."""
+        """Report the current run if there is one."""
         if self.count:
             found.append(CorruptBytes(self.count, self._reason))
             self.count = 0

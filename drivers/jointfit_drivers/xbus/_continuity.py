@@ -1,26 +1,26 @@
 """Counter and clock of an Xbus device: lost messages, restarts, and undetected corruption.
 
-An orientation *follows* another one if counter and device time advanced together, or, where only
-one of them is sent, if it advanced by a few periods. Every MTData2 increments the counter. Only
-messages with an orientation are compared, because others may contain time of another clock (GNSS).
+An orientation *follows* another orientation if counter and device time advanced together. If only
+one of them is sent, it must have advanced by a few periods. Every MTData2 message increments the
+counter. Only messages with an orientation are compared, because others may contain the time of
+another clock (GNSS).
 
 | orientation                                   | outcome                                         |
 |-----------------------------------------------|-------------------------------------------------|
-| follows the last accepted one                 | accepted; skipped counter values were lost      |
-| does not follow                               | held until the next one                         |
-| the next one follows the last accepted one    | the held one was corrupt and is dropped         |
-| the next one follows the held one             | both accepted; a restart if device time jumped  |
+| follows the last accepted orientation         | accepted; skipped counter values were lost      |
+| does not follow                               | held until the next orientation                 |
+| the next follows the last accepted one        | the held one is corrupt and is dropped          |
+| the next follows the held one                 | both accepted; a restart if device time jumped  |
 |                                               | but neither counter nor arrival time did, and   |
 |                                               | no backlog explains it; a counter jump if time  |
 |                                               | advanced by one period                          |
-| the next one follows neither                  | the held one is dropped, the next one held      |
+| the next follows neither                      | the held one is dropped, the next one is held   |
 
-An eight-bit checksum passes one corrupt message in 256, so a single message proves neither a loss
-nor a restart. Counter and time agree if the counts expected from the time, at the measured rate,
-differ from those counted by at most 2 % plus four, modulo 65536. The nominal rate is used for the
-first samples only.
+The eight-bit checksum accepts one corrupt message in 256, so a single message proves neither a loss
+nor a restart. The number of counts expected from the time and the measured rate may differ from the
+counted number by 2 % plus four, modulo 65536. The nominal rate is used only for the first samples.
 
-Invariant: integers in, steps out; every input is accepted.
+Invariant: the result depends only on the values fed, and every input is accepted.
 """
 
 from __future__ import annotations
@@ -32,44 +32,46 @@ from jointfit_protocols.xbus.configuration import TICK_NS, WRAP_32_BIT, WRAP_DAY
 
 _COUNTS = 1 << 16
 _GAP = 1.5
-"""Largest time, in periods, between two messages if only the counter jumped."""
+"""Longest time between two messages for which a jump of the counter alone is accepted, periods."""
 _PLAUSIBLE_GAP = 3600 * 1_000_000_000 // TICK_NS
-"""Longest plausible gap, ticks: one hour, longer than any stall or buffered data."""
+"""Longest plausible gap, ticks. One hour is longer than any delay or buffer."""
 _SLACK_COUNTS = 4
-"""Counts by which counter and time may differ."""
+"""Number of counts by which counter and time may differ."""
 _SLACK_SHARE = 0.02
-"""Share of the elapsed counts by which counter and time may differ in addition."""
+"""Additional share of the elapsed counts by which counter and time may differ."""
 _LEARNED = 10
-"""Counts after which the measured rate replaces the nominal one."""
+"""Number of counts after which the measured rate replaces the nominal rate."""
 _PACE_NS = 250_000_000
-"""Largest difference, ns, of elapsed device and arrival time without a restart or a backlog."""
+"""Largest difference between elapsed device and arrival time without restart or backlog, ns."""
 _LATEST_NS = 30_000_000_000
-"""Longest delay, ns, of the first messages after opening."""
+"""Longest delay of the first messages after opening, ns."""
 _DISTINCT = 50_000
-"""Longest gap, counts, in which counter and time can disagree.
+"""Longest gap in which counter and time can disagree, counts.
 
-After a longer gap, the slack allows any pair of counter and time."""
+After a longer gap, the permitted difference includes any pair of counter and time."""
 
 
 class XbusStep(NamedTuple):
     """Classification of one orientation."""
 
     lost: int = 0
-    """Number of messages lost before this orientation, or before the held one that it confirms."""
+    """Number of messages lost before this orientation, or before the held one if it is
+    confirmed."""
     restarted: bool = False
     """Whether the device restarted before the held orientation."""
     held: bool = False
-    """Whether this orientation is to be held until the next orientation."""
+    """Whether this orientation must be held until the next orientation."""
     confirmed: bool = False
-    """Whether the held orientation is valid and is returned first; otherwise it is dropped."""
+    """Whether the held orientation is valid and must be returned first; otherwise it is dropped."""
     lost_since: int = 0
     """Number of messages lost between the confirmed orientation and this one."""
     counter_jumped: bool = False
-    """Whether only the counter jumped before the held orientation; no message was then lost."""
+    """Whether only the counter jumped before the held orientation. In this case no message was
+    lost."""
 
 
 class _OrientationPoint(NamedTuple):
-    """One orientation: counter, time, arrival, and the number of messages received by then."""
+    """One orientation: counter, time, arrival, and number of messages received until then."""
 
     counter: int | None
     ticks: int | None
@@ -82,18 +84,18 @@ _HELD = XbusStep(held=True)
 
 
 class XbusContinuity:
-    """Tracks counter and time of one device.
+    """Checks counter and time of one device.
 
     Parameters
     ----------
     rate_hz : float
-        Nominal rate, Hz, used until the rate of the stream is measured.
+        Nominal rate, Hz. It is used until the rate of the stream is measured.
     """
 
     def __init__(self, rate_hz: float) -> None:
         self.modulus: int | None = None
-        """Ticks after which device time restarts at 0; None until the device model or the first
-        wrap determines it."""
+        """Number of ticks after which device time restarts at 0; None until the device model or the
+        first wrap determines it."""
         self._nominal = 1_000_000_000 / TICK_NS / rate_hz
         self._messages = 0
         self._last: _OrientationPoint | None = None
@@ -107,7 +109,7 @@ class XbusContinuity:
         self._messages += 1
 
     def orientation(self, counter: int | None, ticks: int | None, arrival_ns: int) -> XbusStep:
-        """Return the step for a message with an orientation.
+        """Return the classification of a message with an orientation.
 
         Parameters
         ----------
@@ -116,7 +118,7 @@ class XbusContinuity:
         ticks : int, optional
             Device time of the message, in units of 100 us.
         arrival_ns : int
-            Arrival time of the message, host monotonic ns.
+            Arrival time of the message, monotonic ns of the host.
         """
         self._messages += 1
         point = _OrientationPoint(counter, ticks, arrival_ns, self._messages)
@@ -134,7 +136,7 @@ class XbusContinuity:
             self._held = point
             return _HELD
 
-        # `held` and `point` follow each other and not `last`: accept both.
+        # `held` and `point` follow each other, but do not follow `last`. Both are accepted.
         trusted, self._held = self._trusted, None
         step = self._classify(last, held) if trusted else _CONTINUES
         if step.restarted or not trusted:
@@ -145,19 +147,19 @@ class XbusContinuity:
         return step._replace(confirmed=True, lost_since=self._accept(held, point).lost)
 
     def forget(self) -> None:
-        """Start again with the next message: the device reported a restart."""
+        """Discard the state, because the device reported a restart."""
         self._last = self._held = None
         self._trusted = False
         self._sum_ticks = self._sum_counts = 0
         self._delay = BacklogDelay()
 
     def _accept(self, last: _OrientationPoint, point: _OrientationPoint) -> XbusStep:
-        """Store `point` as the last point and update the measured rate."""
+        """Store `point` as the last point, and update the measured rate."""
         self._last, self._trusted = point, True
         self._delay_to(last, point)
 
         counts, ticks = _counts(last, point), self._ticks(last, point)
-        # the rate cannot be measured with a clock that does not advance
+        # The rate cannot be measured with a clock that does not advance.
         if counts and ticks and counts <= _DISTINCT:
             self._sum_ticks += ticks
             self._sum_counts += counts
@@ -165,7 +167,7 @@ class XbusContinuity:
         return XbusStep(lost) if lost else _CONTINUES
 
     def _classify(self, last: _OrientationPoint, held: _OrientationPoint) -> XbusStep:
-        """Return the step between two points that do not follow."""
+        """Return the classification of two points that do not follow each other."""
         ticks, counts = self._ticks(last, held), _counts(last, held)
         if ticks is None:  # counter only: it decreases at a restart only
             fell = counts is not None and counts > _DISTINCT
@@ -177,7 +179,7 @@ class XbusContinuity:
             return XbusStep(_lost(last, held) + max(turns, 0) * _COUNTS)
         if plausible and (counts is None or ticks <= _GAP * self._period):
             return XbusStep(counter_jumped=counts is not None)
-        # A few bits of either message may be corrupt, or a backlog ended here: it is a restart only
+        # Some bits of a message may be corrupt, or a backlog may have ended. It is a restart only
         # if device time also disagrees with the arrival times.
         elapsed_ns = held.arrival_ns - last.arrival_ns
         delay_ns = self._delay.limit(_PACE_NS, _LATEST_NS)
@@ -185,7 +187,7 @@ class XbusContinuity:
         return XbusStep(restarted=not continued)
 
     def _delay_to(self, last: _OrientationPoint, point: _OrientationPoint) -> None:
-        """Update the delay with a point of the same clock as the preceding point."""
+        """Update the delay with a point on the same clock as the previous point."""
         ticks = self._ticks(last, point)
         if ticks is not None:
             self._delay.feed(ticks * TICK_NS, point.arrival_ns - last.arrival_ns)
@@ -204,7 +206,7 @@ class XbusContinuity:
 
     @property
     def _period(self) -> float:
-        """Ticks per count; never 0."""
+        """Number of ticks per count; never 0."""
         if self._sum_counts < _LEARNED:
             return self._nominal
         return self._sum_ticks / self._sum_counts
@@ -233,7 +235,7 @@ class XbusContinuity:
         return step
 
     def _agree(self, ticks: int, counts: int) -> bool:
-        """Whether `ticks` and `counts` agree at this rate, modulo the counter's width."""
+        """Return whether `ticks` and `counts` agree at this rate, modulo the counter's width."""
         expected = round(ticks / self._period)
         off = (counts - expected) % _COUNTS
         return min(off, _COUNTS - off) <= _SLACK_COUNTS + _SLACK_SHARE * expected
@@ -247,7 +249,7 @@ def _counts(last: _OrientationPoint, point: _OrientationPoint) -> int | None:
 
 
 def _lost(last: _OrientationPoint, point: _OrientationPoint) -> int:
-    """Return the number of messages that were lost between two points."""
+    """Return the number of messages lost between two points."""
     counts = _counts(last, point)
     if counts is None or counts > _DISTINCT:  # the counter went back by a few
         return 0

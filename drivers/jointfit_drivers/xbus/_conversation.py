@@ -1,10 +1,10 @@
-"""Requests to an Xbus device and its replies, while all its bytes are passed on to the daemon.
+"""Exchange of requests and replies with an Xbus device.
 
-Bytes before the first acknowledgement are old or foreign and are discarded. From the
-acknowledgement on, every byte is emitted once, so that the decoder also receives the device's
+Bytes before the first acknowledgement are old or come from another device, and are discarded. From
+the acknowledgement on, every byte is emitted once, so that the decoder also receives the device's
 replies.
 
-Source: MT0101P rev. 2020.A, state diagram; the 500 ms are its time-outs.
+Source: MT0101P rev. 2020.A, state diagram, which defines a time-out of 500 ms.
 """
 
 from __future__ import annotations
@@ -24,30 +24,30 @@ if TYPE_CHECKING:
 REPLY_S = 0.5
 """Longest wait for a reply, s."""
 OUTSTANDING_S = 2.0
-"""Longest wait for a reply to one GoToConfig while the device is sending data, s. Some devices take
-1.5 s, and further requests would queue behind the first.
+"""Longest wait for a reply to one GoToConfig while the device sends data, s. Some devices take 1.5
+s, and further requests would only be queued after the first.
 """
 _MOST_REPLY_S = 8.0
-"""Upper limit of the wait for a reply of a slow device, s."""
+"""Longest wait for a reply of a slow device, s."""
 _QUIET_S = 0.1
-"""Pause, s, after which the rest of a message with a corrupt length is no longer expected."""
+"""Pause after which the rest of a message with a corrupt length is no longer expected, s."""
 _KNOWN = frozenset(map(int, XbusMessageId))
 _OTHER_ADDRESS = 0x01
 """Bus address that a stand-alone device also uses in replies."""
 _KEPT = 8192
-"""Bytes stored before the acknowledgement; more than one message of greatest length, whose data may
-contain the same bytes by chance."""
+"""Number of bytes stored before the acknowledgement. It exceeds one message of the largest length,
+whose data may look like an acknowledgement by chance."""
 
 
 class XbusConversation:
-    """Requests and replies of one device on one port.
+    """Exchange of requests and replies with one device on one port.
 
     Parameters
     ----------
     port : SerialPort
         Open port.
     emit : Emit
-        Receives all bytes from the first acknowledgement of configuration mode on.
+        Function that receives all bytes from the first acknowledgement of configuration mode on.
     """
 
     def __init__(self, port: SerialPort, emit: Emit) -> None:
@@ -60,12 +60,13 @@ class XbusConversation:
         self.received = 0
         """Number of bytes received so far."""
         self.reply_s = REPLY_S
-        """Wait for a reply, s; longer for a device that acknowledged late."""
+        """Current wait for a reply, s. It is longer for a device that acknowledged late."""
         self.understood = 0
-        """Messages so far that only an Xbus device sends: noise may pass a checksum."""
+        """Number of received messages that only an Xbus device sends, because noise may pass a
+        checksum."""
 
     def reset(self) -> None:
-        """Discard received bytes, here and in the port: for another speed or a new start."""
+        """Discard received bytes, here and in the port, for another speed or a new start."""
         self._port.flush_input()
         self._decoder, self._recent = XbusCodec(), b""
         self.received = self.understood = 0
@@ -75,7 +76,7 @@ class XbusConversation:
         await self._port.write(encode(mid, data))
 
     async def request(self, mid: int, data: bytes = b"", *, tries: int = 2) -> XbusMessage | None:
-        """Send a request until its reply or an error arrives; return None if nothing arrives."""
+        """Send a request until its reply or an error arrives; return None if neither arrives."""
         for _ in range(tries):
             await self.send(mid, data)
             reply = await self.receive({mid + 1, XbusMessageId.ERROR}, self.reply_s)
@@ -92,19 +93,19 @@ class XbusConversation:
         late_s: float = 0.0,
         late_if_silent: bool = False,
     ) -> bool:
-        """Send GoToConfig until it is acknowledged; from then on all bytes are emitted.
+        """Send GoToConfig until it is acknowledged. After that, all bytes are emitted.
 
         Parameters
         ----------
         tries : int
             Largest number of requests.
         wait_s : float
-            Interval between requests on a silent line, s.
+            Interval between requests while the device sends nothing, s.
         late_s : float
-            Tolerated delay of an acknowledgement, s. If positive, a device that sends data has
-            one pending request at a time, at intervals of `OUTSTANDING_S`.
+            Permitted delay of an acknowledgement, s. If it is positive and the device sends data,
+            only one request is pending at a time, at intervals of `OUTSTANDING_S`.
         late_if_silent : bool
-            Whether `late_s` also applies to a silent line.
+            Whether `late_s` also applies while the device sends nothing.
 
         Returns
         -------
@@ -130,19 +131,20 @@ class XbusConversation:
 
             reply = await self.receive(wanted, wait_s)
             if reply is not None and reply.mid == XbusMessageId.WAKE_UP:
-                # The device has just started and waits for this answer.
+                # The device has just started, and waits for this answer.
                 await self.send(XbusMessageId.WAKE_UP_ACK)
                 await self.send(XbusMessageId.GOTO_CONFIG)
                 reply = await self.receive({XbusMessageId.GOTO_CONFIG_ACK}, wait_s)
             if reply is not None:
                 took = loop.time() - began
-                # replies to the pending requests may still arrive, in order
+                # Replies to earlier requests may still arrive. They arrive in the order of the
+                # requests.
                 if took > wait_s and late_s:
                     self.reply_s = min((sent + 1) * took, _MOST_REPLY_S)
                 return True
 
     async def receive(self, mids: Collection[int], wait_s: float) -> XbusMessage | None:
-        """Return the first message with one of `mids`, or None after `wait_s` seconds."""
+        """Return the first message with one of `mids`; None after `wait_s` seconds."""
         loop = asyncio.get_running_loop()
         until = loop.time() + wait_s
         while (left := until - loop.time()) > 0:
@@ -176,7 +178,7 @@ class XbusConversation:
 
 
 def _is_certain(message: XbusMessage) -> bool:
-    """Whether address, identifier and content identify an Xbus message, besides its checksum."""
+    """Return whether address, identifier and content also identify an Xbus message."""
     if message.bid not in {MASTER, _OTHER_ADDRESS} or message.mid not in _KNOWN:
         return False
     return message.mid != XbusMessageId.MT_DATA2 or bool(mtdata2.split(message.data))

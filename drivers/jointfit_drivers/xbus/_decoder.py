@@ -1,10 +1,10 @@
-"""Decoder of the Xbus driver: chunks in, samples in SI units with canonical orientation out.
+"""Decoder of Xbus devices: converts chunks to samples in SI units with canonical orientation.
 
-A sample is stamped with the arrival of its first byte. On a serial line this is the arrival of the
-chunk minus the duration of the message and of the bytes behind it, at ten bits per byte. On USB it
-is the arrival of the chunk.
+The stamp of a sample is the arrival of its first byte. On a serial line, this is the arrival of the
+chunk minus the duration of the message and of all later bytes in the chunk, at ten bits per byte.
+On USB, it is the arrival of the chunk.
 
-Invariant: the output depends only on the chunks fed; the decoder reads no clock and no port.
+Invariant: the output depends only on the chunks fed. The decoder reads no clock and no port.
 """
 
 from __future__ import annotations
@@ -47,27 +47,27 @@ if TYPE_CHECKING:
     from jointfit_protocols.xbus.mtdata2 import Value
 
 _BITS = 10
-"""Bits of one byte on the line, 8N1."""
+"""Number of bits of one byte on the line (8N1)."""
 _SILENCE_FLOOR_NS = 250_000_000
-"""Lower bound, ns, of the silence after which a pending message is discarded.
+"""Smallest silence after which an incomplete message is discarded, ns.
 
-At high speed the duration of 1.5 messages is so short that a host that reads late would look like a
-silent line.
+At high speed, the duration of 1.5 messages is so short that a delayed read by the host would look
+like silence.
 """
 _COUNTER, _TIME = int(Item.PACKET_COUNTER), int(Item.SAMPLE_TIME_FINE)
 _QUATERNION = int(Item.QUATERNION)
 _STATUS_BYTE, _STATUS_WORD = int(Item.STATUS_BYTE), int(Item.STATUS_WORD)
 _WANTED = {_COUNTER, _TIME, _QUATERNION, _STATUS_BYTE, _STATUS_WORD}
-"""Items that are decoded."""
+"""Data items that the decoder reads."""
 _ALIGNED = ("sensor", "local")
 _MESSAGES = frozenset(map(int, XbusMessageId))
 _MEASUREMENTS = (XbusMessageId.MT_DATA2, XbusMessageId.MT_DATA)
 _NEWEST = NewestKnown((1,), "MT Manager")
-"""Firmware of all MTi series since 2012."""
+"""Newest supported firmware, which all MTi series have since 2012."""
 
 
 class _Orientation(NamedTuple):
-    """A message with an orientation that has not been classified yet."""
+    """A message with an orientation that is not classified yet."""
 
     message: XbusMessage
     arrived_ns: int
@@ -84,13 +84,14 @@ class XbusDecoder:
     baud : int, optional
         Line speed, bit/s, for back-dating of stamps; None for USB.
     rate_hz : float
-        Nominal rate, Hz, used until the rate of the stream is measured.
+        Nominal rate, Hz. It is used until the rate of the stream is measured.
     wires : mapping, optional
-        Number of the sync wire of the rig, by the data item that reports its edges.
+        Number of the rig's sync wire for each data item that reports edges.
     raw : RawOrientation, optional
-        Computes orientations from raw measurements; None if the device sends orientations.
+        Filter that computes orientations from raw measurements; None if the device sends
+        orientations.
     legacy : LegacyMeasurements, optional
-        Fields of MTData; None for a device that sends MTData2.
+        Fields of MTData messages; None for a device that sends MTData2 messages.
     bus_id : int, optional
         Bus id of the device whose measurements are used; None: that of the first measurement.
     """
@@ -111,7 +112,7 @@ class XbusDecoder:
         self._other_format_reported = False
         self._wanted = {*_WANTED, *self._wires, *(RAW if raw is not None else ())}
         self._layouts: dict[int, MTData2Layout | None] = {}
-        """MTData2Layout of the first message of each length; a device sends one or two lengths."""
+        """Layout of the first MTData2 message of each length. A device sends one or two lengths."""
         self._xbus = XbusCodec()
         self._bus_ids = BusIdSelection(bus_id)
         self._byte_ns = 0.0 if baud is None else _BITS * 1e9 / baud
@@ -127,9 +128,9 @@ class XbusDecoder:
 
     @property
     def tick_clock(self) -> TickClock:
-        """Unit and modulus of the device time: ticks of 100 us.
+        """Unit and modulus of the device time, which is in ticks of 100 us.
 
-        The modulus follows from the product code, or from the first wrap of the device time.
+        The product code or the first wrap of the device time determines the modulus.
         """
         modulus = self._continuity.modulus or setup.WRAP_32_BIT
         if modulus != self._tick_clock.modulus:  # read after every chunk, and changes once
@@ -147,7 +148,7 @@ class XbusDecoder:
         return self._xbus.discarded + self._refused_bytes
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return the content that `chunk` completed, in wire order; never raises."""
+        """Return the samples and events that `chunk` completes, in wire order; never raise."""
         out: list[Decoded] = []
         if self._xbus.pending:
             quiet_ns = chunk.t_ns - self._last_ns - len(chunk.data) * self._byte_ns
@@ -158,7 +159,7 @@ class XbusDecoder:
         return out + self._take(found) if found else out
 
     def flush(self) -> list[Decoded]:
-        """Discard a pending message and an orientation that waits for confirmation."""
+        """Discard an incomplete message, and an orientation that waits for confirmation."""
         return self._take(self._xbus.flush()) + self._drop_held()
 
     def _take(self, found: list[XbusMessage | CorruptBytes]) -> list[Decoded]:
@@ -180,12 +181,13 @@ class XbusDecoder:
         """Return the arrival of the first byte of `message`, monotonic ns."""
         since = self._xbus.fed - message.end + message.size
         at_ns = self._last_ns - round(since * self._byte_ns)
-        # USB devices and ptys are faster than the configured speed: keep the stamps in order
+        # USB devices and pseudoterminals are faster than the configured speed. Stamps must not
+        # decrease.
         self._arrival_ns = max(self._arrival_ns, at_ns)
         return self._arrival_ns
 
     def _decode_measurement(self, message: XbusMessage) -> list[Decoded]:
-        """Return the content of an MTData2, or the reason of its rejection."""
+        """Return the content of an MTData2 message, or the reason why it is rejected."""
         data = message.data
         layout = self._layouts.get(len(data))
         if layout is not None:
@@ -213,13 +215,13 @@ class XbusDecoder:
             elif kind not in KNOWN_ITEMS:
                 out += self._newer.take_unknown(f"item 0x{kind:04X}", self._last_ns)
 
-        # A layout skips unknown items, so they are counted before.
+        # Unknown items are counted first, because a layout skips them.
         if len(data) not in self._layouts and self._newer.is_settled:
             self._layouts[len(data)] = MTData2Layout.of(items, self._wanted)
         return out + self._decode_values(message, values, world_id)
 
     def _decode_legacy(self, message: XbusMessage) -> list[Decoded]:
-        """Return the content of an MTData, or why it cannot be decoded."""
+        """Return the content of an MTData message, or the reason why it cannot be decoded."""
         legacy = self._legacy
         if legacy is None or legacy.fault:
             if self._other_format_reported:
@@ -239,7 +241,7 @@ class XbusDecoder:
     def _decode_values(
         self, message: XbusMessage, values: Mapping[int, Any], world_id: int
     ) -> list[Decoded]:
-        """Return the content of an MTData2 after the check of its counter and time."""
+        """Check counter and time of an MTData2 message, and return its content."""
         pulses: list[Decoded] = []
         for item, wire in self._wires.items():
             edge = values.get(item)
@@ -264,7 +266,7 @@ class XbusDecoder:
         return self._continue(step, orientation)
 
     def _continue(self, step: XbusStep, orientation: _Orientation) -> list[Decoded]:
-        """Return the samples of the held orientation, if confirmed, then those of `orientation`."""
+        """Return the sample of the held orientation, if confirmed, then that of `orientation`."""
         held = self._held
         out = [] if step.confirmed else self._drop_held()
         self._held = orientation if step.held else None
@@ -310,7 +312,7 @@ class XbusDecoder:
         else:
             out.append(ImuSample(arrived_ns, q, native, ticks, counter, status))
 
-        # Warn once if hardly any quaternion has norm 1.
+        # Warn once if hardly any quaternion has the norm 1.
         if not self._norm_checked:
             self._norm_checked, norm = self._gate.judged, self._gate.misconfigured_norm
             if norm is not None:
@@ -330,7 +332,7 @@ class XbusDecoder:
         return Corrupt(message.size, reason, rejected=1)
 
     def _device_events(self, message: XbusMessage) -> list[Decoded]:
-        """Return the events of a message other than a measurement."""
+        """Return the events of a message that is not a measurement."""
         mid, data = message.mid, message.data
         if mid == XbusMessageId.WAKE_UP:
             if data:  # a WakeUp has no data: this is a corrupt measurement
@@ -375,7 +377,7 @@ def _gap(lost: int) -> list[Decoded]:
 
 
 def _device_property(mid: int, data: bytes) -> dict[str, object]:
-    """Return the device property in a reply; empty for other and malformed messages."""
+    """Return the device property in a reply; empty for other replies and malformed messages."""
     if mid == XbusMessageId.ALIGNMENT_ROTATION_ACK:
         rotation = setup.decode_alignment(data)
         if rotation is None or rotation.frame >= len(_ALIGNED):

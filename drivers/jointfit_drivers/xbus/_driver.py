@@ -1,7 +1,7 @@
 """Driver of Xsens / Movella IMUs that use Xbus on a serial port or USB.
 
 `XbusDecoder` is the pure part. `XbusImu.run` opens the port, brings the device into measurement
-mode and reads until cancelled. `run` passes nothing but chunks to the decoder.
+mode and reads until cancelled. The decoder receives only the chunks that `run` emits.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class XbusImu:
-    """One Xbus device: orientation, device time in units of 100 us, message counter."""
+    """One Xbus device: orientation, device time in units of 100 us, and message counter."""
 
     Settings: ClassVar[type[XbusSettings]] = XbusSettings
     wire: ClassVar[Wire] = "stream"
@@ -55,8 +55,8 @@ class XbusImu:
         DeviceLostError
             The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            The file is not a serial port, the device uses another speed, no Xbus device answers, or
-            the output configuration differs while ``persist`` is false.
+            The file is not a serial port, or no Xbus device answers. Or the device uses another
+            speed, or its output configuration differs while ``persist`` is false.
         """
         settings = self._settings
         await self._reception.run(

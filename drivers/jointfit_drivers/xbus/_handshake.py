@@ -1,9 +1,9 @@
-"""From an open port to a measuring Xbus device, or to the error that explains the failure.
+"""Start of an Xbus device: makes it measure, or raises an error that explains the failure.
 
-The stored configuration of the device is read and compared. A setting is changed only where it
-differs in a relevant way and ``persist`` allows the change, because an Xbus device stores every
-setting in flash at once. A fault that may clear by itself raises `DeviceLostError`, any other
-`DeviceMisconfiguredError`.
+The driver reads the stored configuration of the device. It changes a setting only if the difference
+matters and ``persist`` permits the change, because an Xbus device stores every setting in flash at
+once. A fault that may end without a change of the settings raises `DeviceLostError`. All other
+faults raise `DeviceMisconfiguredError`.
 """
 
 from __future__ import annotations
@@ -30,19 +30,21 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LINE_SPEEDS = (921_600, 115_200, 460_800, 230_400, 2_000_000, 57_600, 38_400, 19_200, 9_600)
-"""Line speeds to search, bit/s: factory settings and common choices first."""
+"""Line speeds for the search, bit/s: factory settings and usual speeds first."""
 _LISTEN_S = 0.15
-"""Time at each speed of the search, s. An acknowledgement takes 10 ms at 9600 baud."""
+"""Duration of the search at each speed, s. An acknowledgement takes 10 ms at 9600 baud."""
 _RESETS, _RESET_WAIT_S = 50, 0.1
-"""Requests after a reset, 0.1 s apart. A stuck MTi-G-700 answered 1.8 s after its reset."""
+"""Number of requests after a reset, and their interval, s. A stuck MTi-G-700 answered 1.8 s after
+its reset."""
 _FRAMES = (0, 1)
-"""Frames of the alignment rotations: sensor, local."""
+"""Numbers of the two frames that alignment rotations refer to: sensor and local."""
 _UNKNOWN_MESSAGE = b"\x04"
-"""Error code of a device that does not know a message."""
+"""Error code that a device sends for an unknown message."""
 _RATE_SHARE = 0.01
-"""Largest difference between the rate of an older device and `rate_hz`: periods are rounded."""
+"""Largest relative difference between the rate of an older device and `rate_hz`, because periods
+are rounded."""
 _NO_SYNC = bytes(12)
-"""An entry that is off. A request without data would only read the settings."""
+"""Entry for a sync function that is off. A request without data would only read the settings."""
 
 
 class XbusHandshake:
@@ -51,12 +53,12 @@ class XbusHandshake:
     Parameters
     ----------
     port, emit : SerialPort, Emit
-        Open port, and the receiver of the device's bytes.
+        Open port, and function that receives the device's bytes.
     settings : XbusSettings
         Table of the device in rig.toml.
     hunt : bool
-        Whether to search for a silent device at other speeds. A device whose bytes cannot be
-        decoded is always searched for.
+        Whether to search for a silent device at other speeds. If the device's bytes cannot be
+        decoded, the other speeds are always searched.
     """
 
     def __init__(
@@ -72,15 +74,15 @@ class XbusHandshake:
         self._needs = required_outputs(settings.orientation, magnetometer=settings.magnetometer)
 
     async def ensure_measuring(self) -> None:
-        """Return when the device measures according to the settings.
+        """Return when the device measures with the configured settings.
 
         Raises
         ------
         DeviceLostError
-            The device is silent, unplugged, or stopped answering.
+            The device does not answer, was unplugged, or stopped answering.
         DeviceMisconfiguredError
-            The device uses another speed, is of another kind, or the output configuration differs
-            and may not be written.
+            The device uses another speed or is of another kind. Or the output configuration differs
+            and must not be written.
         """
         settings = self._settings
         settings.require_line_speed()
@@ -96,14 +98,14 @@ class XbusHandshake:
         if not entered:
             await self._explain_silence()
 
-        # Properties that the decoder reports; only the device id is required.
+        # The decoder reports these properties. Only the device id is required.
         await self._answer(XbusMessageId.REQ_DEVICE_ID)
         for mid in (
             XbusMessageId.REQ_PRODUCT_CODE,
             XbusMessageId.REQ_FIRMWARE,
             XbusMessageId.FILTER_PROFILE,
         ):
-            # The reply is emitted. Older devices refuse some requests.
+            # The reply is emitted. Older devices refuse some of these requests.
             reply = await self._conversation.request(mid)
             if reply is not None and reply.mid == XbusMessageId.PRODUCT_CODE:
                 self._product_code = setup.decode_text(reply.data)
@@ -119,7 +121,7 @@ class XbusHandshake:
         self._refuse_error(reply, "refuses to start measuring")
 
     async def _check_legacy(self) -> None:
-        """Compare output mode, settings and rate of an older device; nothing is written."""
+        """Compare output mode, settings and rate of an older device, without writing."""
         replies = {
             mid: await self._answer(mid)
             for mid in (XbusMessageId.OUTPUT_MODE, XbusMessageId.OUTPUT_SETTINGS)
@@ -141,7 +143,7 @@ class XbusHandshake:
             )
 
     async def _answer(self, mid: int, data: bytes = b"") -> XbusMessage:
-        """Return the reply to a request that the device must answer; it may be an error."""
+        """Return the reply to a request that the device must answer; the reply may be an error."""
         reply = await self._conversation.request(mid, data, tries=3)
         if reply is None:
             raise self._settings.stopped_answering()
@@ -165,7 +167,7 @@ class XbusHandshake:
             "%s: writing its output configuration: %s", self._settings.id, "; ".join(faults)
         )
 
-        # Raw measurements are in sensor axes: only an orientation has a world.
+        # Raw measurements are in sensor axes. Only an orientation refers to a world.
         world: World = self._settings.world if self._needs is ORIENTATION else "ENU"
         counters = (Item.PACKET_COUNTER, Item.SAMPLE_TIME_FINE, Item.STATUS_WORD)
         wanted = (
@@ -187,7 +189,7 @@ class XbusHandshake:
             )
 
     def _refuse_to_write(self, faults: list[str], hint: str = "") -> None:
-        """Raise with the necessary changes unless ``persist`` allows them."""
+        """Raise an error that lists the necessary changes, unless ``persist`` permits them."""
         if not self._settings.persist:
             raise DeviceMisconfiguredError(
                 f"{self._path}: {'; '.join(faults)}{hint}: set persist = true once to write it "
@@ -195,7 +197,7 @@ class XbusHandshake:
             )
 
     async def _ensure_sync(self) -> None:
-        """Configure the sync lines if the settings contain any."""
+        """Configure the sync lines if rig.toml contains any."""
         if self._settings.sync is None:
             return
         asked = _sync_lines.sync_entries(self._settings.sync, self._product_code)
@@ -270,7 +272,7 @@ class XbusHandshake:
         )
 
     async def _other_speed(self) -> int | None:
-        """Return the speed at which the device answers; it continues to measure as before."""
+        """Return the speed at which the device answers; the device then continues to measure."""
 
         async def answers() -> bool:
             answered = await self._conversation.enter_config(tries=1, wait_s=_LISTEN_S)
@@ -296,9 +298,9 @@ def legacy_differences(
     *,
     skipped: bool,
 ) -> list[str]:
-    """Return the differences between an older device and the settings; empty if none.
+    """Return the differences between an older device and the settings; empty if there are none.
 
-    Required are orientations and the sample counter at ``rate_hz``, without samples left out.
+    Orientations and the sample counter are required at ``rate_hz``, and no sample may be skipped.
     """
     if mode is None or stored is None:
         return ["it does not report its output mode"]
@@ -330,9 +332,9 @@ def output_differences(
 ) -> list[str]:
     """Return the differences between an output configuration and the required one; empty if none.
 
-    Required are a counter, a fine time, `needs` at `rate` Hz and the items that report edges
-    (`triggers`). Precision, world and further items do not matter, because the decoder reads
-    them all.
+    The required outputs are a counter, a fine time, `needs` at `rate` Hz, and the items that report
+    edges (`triggers`). Precision, world and additional items do not matter, because the decoder can
+    read all of them.
     """
     faults = []
     kinds = {output.data_id & 0xFFF0: output.rate for output in found}
@@ -360,7 +362,7 @@ def _hz(rate: int) -> str:
 
 
 def _rate_hint(found: tuple[setup.Output, ...], needs: tuple[RequiredOutput, ...]) -> str:
-    """Return a hint at the device's own rate, where that alone resolves the differences."""
+    """Return a hint to the device's own rate, if this rate alone resolves the differences."""
     rates = {output.rate for output in found if output.data_id & 0xFFF0 in needs[0].items}
     rate = next(iter(rates), 0)
     if rate in {0, setup.MAX_RATE} or output_differences(found, rate, (), needs):

@@ -1,7 +1,8 @@
-"""Measurements of older devices: MTData, whose fields the output mode and settings define.
+"""Measurements of older devices: MTData messages, whose fields depend on output mode and settings.
 
-The device reports both in its replies to the handshake, or rig.toml has them, as for a capture
-without the handshake. Euler angles and matrices become quaternions.
+The device reports output mode and settings in its replies during the handshake. For a capture
+without the handshake, rig.toml defines them. Euler angles and matrices are converted to
+quaternions.
 
 Invariant: the result depends only on the messages fed.
 """
@@ -31,31 +32,31 @@ _QUATERNION = int(Item.QUATERNION)
 
 
 class LegacyMeasurements:
-    """Fields of the MTData messages of one device.
+    """Decodes the fields in the MTData messages of one device.
 
     Parameters
     ----------
     output_mode, output_settings : int, optional
-        As in rig.toml; None: as the device reports them.
+        Values from rig.toml; None if the values that the device reports are used.
     world : {"NWU", "ENU"}
-        World of the device, unless its settings select NED.
+        World of the device, unless its output settings select NED.
     """
 
     def __init__(self, output_mode: int | None, output_settings: int | None, world: World) -> None:
         self._mode, self._settings, self._world = output_mode, output_settings, world
         self._layout: MTDataLayout | None = None
         self.fault = ""
-        """Why messages cannot be decoded; empty if they can."""
+        """Reason why messages cannot be decoded; empty if they can be decoded."""
         self._update()
 
     @property
     def world_id(self) -> int:
-        """Identifier of a quaternion of MTData2 in the same world."""
+        """Identifier of the MTData2 quaternion that refers to the same world."""
         ned = self._layout is not None and self._layout.settings & NED
         return real_id(Item.QUATERNION, world="NED" if ned else self._world)
 
     def reply(self, mid: int, data: bytes) -> None:
-        """Take the output mode, the output settings or both from a reply of the device."""
+        """Process a reply of the device that contains the output mode or the output settings."""
         if mid == XbusMessageId.OUTPUT_MODE_ACK:
             self._mode = decode_output_mode(data) if data else self._mode
         elif mid == XbusMessageId.OUTPUT_SETTINGS_ACK:
@@ -70,7 +71,7 @@ class LegacyMeasurements:
         self._update()
 
     def read(self, data: bytes) -> Mapping[int, Any] | None:
-        """Return the values of a message by the identifiers of MTData2; None if it has others."""
+        """Return the values of a message by MTData2 identifiers; None if the fields do not fit."""
         if self._layout is None:
             return None
         values: dict[int, Any] | None = self._layout.read(data)
@@ -93,9 +94,9 @@ class LegacyMeasurements:
 
 
 def _of_matrix(by_columns: tuple[float, ...]) -> Quaternion:
-    """Return the quaternion of a matrix by columns; its norm shows whether it is a rotation."""
+    """Return the quaternion of a matrix by columns. Its norm is 1 only for a rotation."""
     a, d, g, b, e, h, c, f, i = by_columns
-    # Shepperd (1978): the largest component is the most exact.
+    # Shepperd (1978): the largest component is the most accurate.
     squares = (1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i)
     rows = (
         (squares[0], h - f, c - g, d - b),

@@ -1,10 +1,10 @@
-"""Orientation on the gateway from the raw measurements of an Xbus device.
+"""Computation of the orientation on the gateway, from the raw measurements of an Xbus device.
 
-Angular rate arrives as RateOfTurn or DeltaQ, specific force as Acceleration or DeltaV, all in
-sensor axes. Increments are divided by the mean interval of the device clock. Every complete message
-yields one sample once the filter has settled.
+The angular rate is sent as RateOfTurn or DeltaQ, and the specific force as Acceleration or DeltaV,
+all in sensor axes. The increments DeltaQ and DeltaV are divided by the mean interval of the device
+clock. When the filter has settled, every complete message yields one sample.
 
-Invariant: the output depends only on the messages fed; no clock and no port is read.
+Invariant: the output depends only on the messages fed. The module reads no clock and no port.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ _TINY = 1e-12
 
 
 class RawOrientation:
-    """Computes samples from raw items.
+    """Computes samples from raw data items.
 
     Parameters
     ----------
     make_samples : callable
-        Returns a new filter of raw measurements.
+        Function that returns a new filter of raw measurements.
     """
 
     def __init__(self, make_samples: Callable[[], RawSamples]) -> None:
@@ -46,7 +46,7 @@ class RawOrientation:
         self._t_ns = 0
 
     def forget(self) -> None:
-        """Start again: the device and its clock restarted."""
+        """Discard the state, because the device and its clock restarted."""
         self.__init__(self._make_samples)  # type: ignore[misc] # the state of a new filter
 
     def is_complete(self, values: Mapping[int, object]) -> bool:
@@ -64,7 +64,7 @@ class RawOrientation:
         passed = 0 if self._ticks is None else (ticks - self._ticks) % modulus
         period_s = self._samples.period_ns * 1e-9
 
-        # Increments are divided by the interval; both forms are in sensor axes.
+        # Increments are divided by the interval. Rates and increments are both in sensor axes.
         rate, force = values.get(RATES[0]), values.get(FORCES[0])
         if rate is None:
             turn = cast("tuple[float, float, float, float]", values[RATES[1]])

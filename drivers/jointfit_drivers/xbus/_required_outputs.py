@@ -1,9 +1,8 @@
-"""Outputs that an Xbus device must send, by the source of its orientation.
+"""Outputs that an Xbus device must send, which depend on the source of the orientation.
 
-A `RequiredOutput` lists alternative data items; the device must send one of these items. If the
-device sends no item of the list, the driver requests the first item. Increments (DeltaQ, DeltaV)
-are thus accepted in place of rate of turn and acceleration if the device is already configured for
-them.
+A `RequiredOutput` lists alternative data items, one of which the device must send. If the device
+sends none of them, the driver requests the first. Increments (DeltaQ, DeltaV) are therefore
+accepted instead of rate of turn and acceleration if the device is already configured for them.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from typing import NamedTuple
 from jointfit_protocols.xbus.mtdata2 import Item, reals_in
 
 _FRAME_BYTES = 5 + 5 + 7
-"""Framing, packet counter and time, bytes."""
+"""Size of framing, packet counter and time, bytes."""
 _ITEM_HEAD, _FLOAT = 3, 4
 
 
@@ -39,7 +38,7 @@ def required_outputs(orientation: str, *, magnetometer: bool) -> tuple[RequiredO
     Parameters
     ----------
     orientation : {"device", "gateway"}
-        Where the orientation is computed.
+        Place where the orientation is computed.
     magnetometer : bool
         Whether the gateway uses the magnetometer.
     """

@@ -70,7 +70,7 @@ class XbusSettings(GatewaySettings, SerialImuSettings):
 
     @override
     def contradictions(self) -> Iterable[tuple[str, str]]:
-        """Yield keys that MTData does not allow."""
+        """Yield keys that devices with MTData messages do not permit."""
         yield from super().contradictions()
         if self.format != "mtdata":
             for key in ("output_mode", "output_settings"):
@@ -95,7 +95,7 @@ class XbusSettings(GatewaySettings, SerialImuSettings):
     @field_validator("rate_hz")
     @classmethod
     def _rate_the_device_can_run_at(cls, rate_hz: float) -> float:
-        """Refuse rates that are no whole number of Hz."""
+        """Reject rates that are not an integer number of Hz."""
         if rate_hz != int(rate_hz) or rate_hz > MAX_RATE_HZ:
             raise ValueError(f"expected whole Hz up to {MAX_RATE_HZ}, found {rate_hz:g}")
         return rate_hz

@@ -1,6 +1,6 @@
-"""Sync lines of an Xbus device: the settings of rig.toml as the entries that the device stores.
+"""Sync lines of an Xbus device: conversion of rig.toml to the entries that the device stores.
 
-The order of entries is irrelevant to the device, and therefore to the comparison.
+The order of entries does not matter to the device, and is ignored in comparisons.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 _MOST = 0xFFFF
 """Largest value of a 16-bit field."""
 _UNITS_PER_MS = 10
-"""Number of units of pulse width and delay, 100 us, in a millisecond."""
+"""Number of units of pulse width and delay (100 us) in a millisecond."""
 TRIGGERS = {"in1": Item.TRIGGER_IN1, "in2": Item.TRIGGER_IN2}
-"""Item that reports edges of a line."""
+"""Data item that reports the edges of each line."""
 
 Function = Literal[
     "trigger_indication",
@@ -72,7 +72,7 @@ class XbusSyncSettings(Settings):
 
     @override
     def contradictions(self) -> Iterator[tuple[str, str]]:
-        """Refuse combinations that no device supports."""
+        """Yield combinations of settings that no device supports."""
         function: str | None = self.function  # None: cannot be read
         if function is None:
             return
@@ -109,7 +109,7 @@ def sync_entries(
 
 
 def sync_differences(found: Sequence[SyncSetting], asked: Sequence[SyncSetting]) -> list[str]:
-    """Return the entries that the device lacks, and those that were not requested."""
+    """Return the entries that the device lacks, and the entries that were not requested."""
     lacks = [f"it does not have {describe_entry(one)}" for one in asked if one not in found]
     return lacks + [f"it has {describe_entry(one)}" for one in found if one not in asked]
 
@@ -135,7 +135,7 @@ def describe_entry(one: SyncSetting) -> str:
 
 
 def trigger_wires(settings: Iterable[XbusSyncSettings]) -> dict[int, int]:
-    """Return the sync wire of the rig for every item that reports edges."""
+    """Return the number of the rig's sync wire for every data item that reports edges."""
     return {
         int(TRIGGERS[one.line]): one.wire
         for one in settings

@@ -1,4 +1,4 @@
-"""Driver for Xsens XCDI IMUs on a CAN bus."""
+"""Driver for Xsens IMUs that use the protocol XCDI on a CAN bus."""
 
 from jointfit_drivers.xcdi._decoder import XcdiDecoder
 from jointfit_drivers.xcdi._driver import XcdiIdSettings, XcdiImu, XcdiSettings

@@ -1,7 +1,8 @@
 """Counter and time of an XCDI sensor: lost groups, restarts, and shared identifiers.
 
-With d the step of SampleTime and c the step of GroupCounter since the previous group, both modulo
-their widths, and P the measured step of SampleTime per group:
+A group consists of the CAN frames of one sample. In the table, d and c are the steps of SampleTime
+and GroupCounter since the previous group, both modulo their widths. P is the measured step of
+SampleTime per group:
 
 | finding                                                 | outcome                             |
 |---------------------------------------------------------|-------------------------------------|
@@ -15,11 +16,11 @@ their widths, and P the measured step of SampleTime per group:
 | three contradictions that continue each other, or       | two sensors share the identifiers   |
 | 14 broken groups, within 20 groups                      |                                     |
 
-The line of an adapter has no checksum, so a single group is not sufficient evidence of a restart. A
-sensor that is reset contradicts the previous groups once. Two sensors contradict each other
-continuously. The groups of the two sensors cannot be separated, so no group is used.
+The line of an adapter has no checksum, so a single group does not prove a restart. A sensor that is
+reset contradicts the previous groups once. Two sensors with the same identifiers contradict each
+other continuously. Their groups cannot be separated, so no group is used.
 
-Invariant: integers in, steps out; every input is accepted.
+Invariant: the result depends only on the values fed, and every input is accepted.
 """
 
 from __future__ import annotations
@@ -32,27 +33,28 @@ from jointfit_drivers.backlog import BacklogDelay, device_continued
 from jointfit_protocols.xcdi import COUNTER_MODULUS, TICKS_MODULUS
 
 _LEARNED = 10
-"""Steps after which the measured period is used."""
+"""Number of steps after which the measured period is used."""
 _SLACK_COUNTS = 2
 _NEAR = 10
-"""Counts that corruption of counter and time may appear to skip."""
+"""Largest number of counts that corrupt values of counter and time may seem to skip."""
 _SLACK_SHARE = 0.01
 _SILENT = _NEAR + 1
-"""Least silence, groups, over which SampleTime is compared with host time."""
+"""Shortest silence over which SampleTime is compared with host time, groups."""
 _RAN_ON_SHARE = 0.1
-"""Largest difference of SampleTime and host time over a silence, share of the silence."""
+"""Largest difference between SampleTime and host time over a silence, relative to the silence."""
 _LATEST = 3000
-"""Longest delay, groups, of the first groups after opening."""
+"""Longest delay of the first groups after opening, groups."""
 _LONGEST = 20_000
-"""Longest gap, groups; beyond, the tolerance would accept any pair."""
+"""Longest accepted gap, groups. After a longer gap, the tolerance would include any pair of
+values."""
 _BLIND = 100
-"""Longest gap, groups, that is accepted from time alone if the next group confirms it."""
+"""Longest gap that is accepted from the time alone if the next group confirms it, groups."""
 _WINDOW = 20
-"""Groups over which contradictions are counted."""
+"""Number of groups over which contradictions are counted."""
 _CONTRADICTIONS = 3
 _BROKEN = 14
 _ASTRAY = 8
-"""Consecutive contradictions that no sensor explains; the period has then changed."""
+"""Number of consecutive contradictions that no second sensor explains; the period then changed."""
 
 
 class XcdiStep(NamedTuple):
@@ -62,11 +64,11 @@ class XcdiStep(NamedTuple):
     restarted: bool = False
     """Whether the sensor restarted before the held group."""
     shared: bool = False
-    """Whether two sensors send with the same identifiers; this group may then be a mixture."""
+    """Whether two sensors use the same identifiers. In this case the group may mix their frames."""
     held: bool = False
-    """Whether this group is to be held until the next group."""
+    """Whether this group must be held until the next group."""
     confirmed: bool = False
-    """Whether the held group is valid and is returned first; otherwise it is dropped."""
+    """Whether the held group is valid and must be returned first; otherwise it is dropped."""
 
 
 _CONTINUES = XcdiStep()
@@ -74,7 +76,7 @@ _HELD = XcdiStep(held=True)
 
 
 class XcdiContinuity:
-    """Tracks the groups of one sensor."""
+    """Checks the groups of one sensor."""
 
     def __init__(self) -> None:
         self._track = _Track()
@@ -94,16 +96,16 @@ class XcdiContinuity:
         broken: bool,
         host_ticks: int | None = None,
     ) -> XcdiStep:
-        """Return the step for one group.
+        """Return the classification of one group.
 
         Parameters
         ----------
         ticks, counter : int, optional
             SampleTime and GroupCounter of the group.
         broken : bool
-            Whether this group or the preceding group was incomplete.
+            Whether this group or the previous group was incomplete.
         host_ticks : int, optional
-            Arrival time of the group, in ticks of the device; None while the tick is unknown.
+            Arrival time of the group in ticks of the device; None while the tick is unknown.
         """
         step, rivals = self._step(ticks, counter, host_ticks)
         self._contradictions.append(rivals)
@@ -126,7 +128,7 @@ class XcdiContinuity:
     def _step(
         self, ticks: int | None, counter: int | None, host: int | None
     ) -> tuple[XcdiStep, bool]:
-        """Return the step, and whether the group continues earlier contradictions."""
+        """Return the classification, and whether the group continues earlier contradictions."""
         if self._track.continues(ticks, counter):
             self._held, self._astray = None, 0
             lost = self._track.take(ticks, counter, host)
@@ -162,12 +164,12 @@ class XcdiContinuity:
 
 
 class _Track:
-    """Groups that continue each other.
+    """Sequence of groups that continue each other.
 
     Parameters
     ----------
     period : float, optional
-        Ticks per group, if known.
+        Number of ticks per group; None if it is unknown.
     """
 
     def __init__(self, period: float | None = None) -> None:
@@ -185,7 +187,7 @@ class _Track:
         self._steps: list[float] = []
 
     def continues(self, ticks: int | None, counter: int | None) -> bool:
-        """Whether a group may be the next group of this sensor."""
+        """Return whether a group may be the next group of this sensor."""
         count = self._count(counter)
         if count is not None and count > COUNTER_MODULUS // 2:
             return False
@@ -211,9 +213,9 @@ class _Track:
         return near and expected <= _LONGEST
 
     def groups_to(self, later: _Track) -> int | None:
-        """Return the groups from this track to a later one that does not continue it.
+        """Return the number of groups from this track to a later track that does not continue it.
 
-        None if time or counter jumped; small differences of either are corruption.
+        Return None if time or counter jumped. Small differences between them count as corruption.
         """
         if self._ticks is None or later._ticks is None or self.period is None:
             return None
@@ -231,8 +233,8 @@ class _Track:
     def ran_on_to(self, later: _Track) -> bool:
         """Return whether SampleTime advanced by the time between the arrivals.
 
-        The clock then ran on while the sensor was silent, or until the end of a backlog: the sensor
-        did not restart, even if its counter stood still.
+        In this case the clock continued during a silence or a backlog. The sensor did not restart,
+        even if its counter did not advance.
         """
         if self._ticks is None or later._ticks is None or self.period is None:
             return False
@@ -249,7 +251,7 @@ class _Track:
         return near and silence >= _SILENT * self.period
 
     def delay_to(self, later: _Track) -> BacklogDelay:
-        """Return the delay of a later track of the same clock."""
+        """Return the delay of a later track on the same clock."""
         step = self._step_to(later._ticks, later._host)
         if step is not None:
             self.delay.feed(*step)
@@ -262,7 +264,7 @@ class _Track:
         return (ticks - self._ticks) % TICKS_MODULUS, host - self._host
 
     def take(self, ticks: int | None, counter: int | None, host: int | None) -> int:
-        """Add a group that continues this track; return the groups lost before it."""
+        """Add a group that continues this track; return the number of groups lost before it."""
         count = self._count(counter)
         lost = 0 if count is None else max(count - 1 - self._uncounted, 0)
 
@@ -290,7 +292,7 @@ class _Track:
         return lost
 
     def _count(self, counter: int | None) -> int | None:
-        """Return the step of the counter; None if one of the groups has none."""
+        """Return the step of the counter; None if one of the groups has no counter."""
         if counter is None or self._counter is None:
             return None
         return (counter - self._counter) % COUNTER_MODULUS

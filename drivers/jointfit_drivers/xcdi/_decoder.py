@@ -1,10 +1,10 @@
-"""Decoder of the XCDI driver: records of CAN frames in, samples in SI units out.
+"""Decoder of XCDI sensors: converts records of CAN frames to samples in SI units.
 
-A sample is stamped with the first frame of its group, because arbitration delays the later ones.
-Every record of 24 bytes is a message of this sensor, a foreign frame, a note of the host, or
-discarded.
+The stamp of a sample is the arrival of the first frame in its group, because arbitration may delay
+the later frames. A record of 24 bytes is a message of this sensor, a frame of another device, a
+note of the host, or a rejected record.
 
-Invariant: the output depends only on the chunks fed; the decoder reads no clock and no bus.
+Invariant: the output depends only on the chunks fed. The decoder reads no clock and no bus.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     from jointfit_protocols.xcdi import ByteOrder, XcdiIds
 
 _UNDECIDED = 100
-"""Groups after which an undecided unit of SampleTime is reported."""
+"""Number of groups after which an undetermined unit of SampleTime is reported."""
 _TIMELESS = 20
-"""Quaternions after which a missing SampleTime is reported."""
+"""Number of quaternions after which a missing SampleTime is reported."""
 
 
 class XcdiDecoder:
@@ -46,7 +46,7 @@ class XcdiDecoder:
     ids : XcdiIds
         Identifiers of the sensor.
     unit : str
-        ``100us`` or ``1us``, or ``auto``: determined from the data.
+        Unit of SampleTime: ``100us``, ``1us``, or ``auto`` to determine it from the data.
     byte_order : ByteOrder
         Byte order of the payloads.
     rate_hz : float
@@ -73,16 +73,16 @@ class XcdiDecoder:
 
     @property
     def messages(self) -> int:
-        """Number of well-formed frames of this sensor so far."""
+        """Number of well-formed frames received from this sensor."""
         return self._xcdi.messages - self._refused
 
     @property
     def discarded_bytes(self) -> int:
-        """Number of bytes in rejected records and in lost lines of an adapter."""
+        """Number of bytes in rejected records and in lines that an adapter lost."""
         return self._bus.discarded_bytes
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return the content that `chunk` completed, in wire order; never raises."""
+        """Return the samples and events that `chunk` completes, in wire order; never raise."""
         out: list[Decoded] = []
         for item in can.unpack_frames(chunk.data):
             if not isinstance(item, can.CanFrame):
@@ -102,14 +102,14 @@ class XcdiDecoder:
         return out
 
     def flush(self) -> list[Decoded]:
-        """Discard an incomplete group and one that waits for confirmation."""
+        """Discard an incomplete group, and a group that waits for confirmation."""
         self._xcdi.flush()
         out: list[Decoded] = []
         self._drop_held(out)
         return out
 
     def _group(self, group: XcdiGroup, out: list[Decoded]) -> None:
-        """Append the sample of `group` after the check of its counter and time."""
+        """Check counter and time of `group`, and append its sample."""
         ticks, counter = group.ticks, group.counter
         self._has_time = self._has_time or ticks is not None
         self._has_counter = self._has_counter or counter is not None
@@ -174,7 +174,7 @@ class XcdiDecoder:
         out.append(ImuSample(group.t_ns, q, native, ticks, group.counter, group.status))
 
     def _measure(self, ticks: int, group: XcdiGroup, out: list[Decoded]) -> None:
-        """Determine or correct the unit of SampleTime, or check the configured one."""
+        """Determine or correct the unit of SampleTime, or check the configured unit."""
         self._timed += 1
         tick_ns = self._unit.feed(ticks, group.counter, group.t_ns)
 

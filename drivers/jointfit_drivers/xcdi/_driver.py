@@ -1,8 +1,8 @@
 """Driver of Xsens MTi-600, Sirius and Avior IMUs on CAN ("XCDI").
 
-This driver only receives. The device is configured once over its UART (CAN is off by factory
-default). The driver cannot request or set anything over CAN: it only reports a fault and its
-remedy.
+The driver only receives. The user configures the device once over its UART, because CAN is switched
+off by factory default. The driver cannot send requests or settings over CAN, so it only reports a
+fault with its remedy.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _ID_NAMES = XcdiIds._fields[:5]
 
 
 class XcdiIdSettings(Settings):
-    """CAN identifiers of one sensor; every sensor on a bus needs its own block."""
+    """CAN identifiers of one sensor. Every sensor on a bus needs a separate set of identifiers."""
 
     sample_time: int = Field(DataId.SAMPLE_TIME, ge=0, le=EXTENDED_MAX, description="SampleTime")
     group_counter: int = Field(
@@ -55,7 +55,7 @@ class XcdiIdSettings(Settings):
 
     @override
     def contradictions(self) -> Iterator[tuple[str, str]]:
-        """Refuse identifiers that are equal, or whose order would split the frames of a sample."""
+        """Yield identifiers that are equal, or whose order would split the frames of a sample."""
         in_order: tuple[Any, ...] = (self.sample_time, self.group_counter, self.quaternion)
         ids = self.resolved()._asdict() if None not in in_order else dict(self)
 
@@ -82,8 +82,8 @@ class XcdiIdSettings(Settings):
     def resolved(self, *, extended: bool = False) -> XcdiIds:
         """Return all identifiers.
 
-        If `status_word` or `error` is omitted, it gets the offset that the other three have in
-        common from their defaults. Without a common offset it is None.
+        If `status_word` or `error` is omitted, it gets the common offset of the other three
+        identifiers from their defaults. Without a common offset, it is None.
         """
         base = self.quaternion - DataId.QUATERNION
         is_block = (
@@ -114,7 +114,7 @@ class XcdiSettings(CanImuSettings):
 
     @override
     def contradictions(self) -> Iterator[tuple[str, str]]:
-        """Refuse 11-bit identifiers out of range."""
+        """Yield 11-bit identifiers that are out of range."""
         ids: Any = self.ids  # None: cannot be read
         for name, number in ids or ():
             if number is not None and number > STANDARD_MAX and self.extended_ids is False:
@@ -146,9 +146,9 @@ class XcdiImu:
     def candidate_tables(cls, seen: Mapping[tuple[int, bool], int]) -> Iterator[dict[str, Any]]:
         """Yield the identifiers of sensors that may have sent the received frames.
 
-        A candidate is a Quaternion (8 bytes) with the next lower GroupCounter (2 bytes) and the
-        next lower SampleTime (4 bytes), because a sensor needs ascending identifiers. Both byte
-        orders are candidates. See `jointfit_daemon.device_search`.
+        A candidate is a Quaternion (8 bytes), the nearest lower GroupCounter (2 bytes) and the
+        nearest lower SampleTime (4 bytes), because a sensor needs ascending identifiers. Each
+        candidate is tried with both byte orders. See `jointfit_daemon.device_search`.
         """
         for (quaternion, extended), size in sorted(seen.items()):
             if size != _SAMPLE_BYTES[DataId.QUATERNION]:
@@ -191,9 +191,10 @@ class XcdiImu:
         Raises
         ------
         DeviceLostError
-            The bus is absent or down, the adapter unplugged, or this sensor silent for `silence_s`.
+            The bus is absent or down, the adapter is unplugged, or the sensor is silent for
+            `silence_s`.
         DeviceMisconfiguredError
-            This kind of bus is not available, or another sensor of the rig uses the same
+            This type of bus is not available, or another sensor of the rig uses the same
             identifiers.
         """
         by_id, byte_order = self._ids.by_id(), self._settings.byte_order
@@ -201,7 +202,7 @@ class XcdiImu:
         (needed,) = (key for key, data_id in by_id.items() if data_id is DataId.QUATERNION)
 
         def resembles(data: bytes) -> bool:
-            """Whether `data` could be a quaternion: four integers of norm 1."""
+            """Return whether `data` may be a quaternion: four integers with the norm 1."""
             counts = decode(DataId.QUATERNION, data, byte_order)
             if isinstance(counts, CorruptBytes):
                 return False

@@ -1,24 +1,24 @@
 """Time and motion of an x-IMU3: lost messages, restarts, and corruption that no checksum detects.
 
-A message *follows* the last accepted one if its time advances by a few periods and its orientation
-continues the motion. With the orientations q0, q1 and q2 at the times t0, t1 and t2, the deviation
-from a uniform motion is, as an angle in rad,
+A message *follows* the last accepted message if its time advances by a few periods and its
+orientation continues the motion. Three messages have the orientations q0, q1 and q2 and the times
+t0, t1 and t2. Their deviation from a uniform motion, as an angle in rad, is
 
     E = 2 |q2 - q1 - (q1 - q0) (t2 - t1) / (t1 - t0)|.
 
-E may be twice the largest E of the last seconds: a sensor that accelerates raises the limit.
+The limit for E is twice the largest E of the last seconds, so a sensor that accelerates raises it.
 
 | message                                       | outcome                                          |
 |-----------------------------------------------|--------------------------------------------------|
-| follows the last accepted one                 | accepted; skipped periods were lost              |
-| does not follow                               | held until the next one                          |
-| the next one follows the last accepted one    | the held one was corrupt and is dropped          |
-| the next one is a few periods and a possible  | both accepted; a restart if device time did not  |
+| follows the last accepted message             | accepted; skipped periods were lost              |
+| does not follow                               | held until the next message                      |
+| the next follows the last accepted one        | the held one is corrupt and is dropped           |
+| the next is a few periods and a possible      | both accepted; a restart if device time did not  |
 | rotation after the held one                   | advance like the arrival times                   |
-| the next one is neither                       | the held one is dropped, the next one held       |
+| the next is neither                           | the held one is dropped, the next one is held    |
 
-Invariant: numbers in, steps out; every input is accepted. A motion that the gyroscope can measure
-is delayed by one message at most, never dropped twice in a row.
+Invariant: the result depends only on the values fed, and every input is accepted. A motion within
+the range of the gyroscope is delayed by at most one message, and never dropped twice in a row.
 """
 
 from __future__ import annotations
@@ -34,29 +34,29 @@ if TYPE_CHECKING:
 _FEW = 5.5
 """Largest number of periods between two successive messages."""
 _FIRST_US = 1_000_000
-"""Time, us, within which a message follows while the period is unknown: that of a device at 1
+"""Time within which a message follows while the period is unknown, us. It permits a device at 1
 Hz."""
 _EXTRAPOLATED = 2.5
-"""Largest interval, in periods, over which motion is extrapolated."""
+"""Longest interval over which motion is extrapolated, periods."""
 _STEADY = 0.005
 """Deviation from a uniform motion that is always accepted, rad."""
 _DECAY = 0.998
-"""Factor of the largest deviation for each message: half in 3.5 s at 100 Hz."""
+"""Factor by which the largest deviation decreases per message: one half in 3.5 s at 100 Hz."""
 _FASTEST = 60.0
-"""Largest angular rate between two messages, rad/s; the range of the gyroscope is 35 rad/s."""
+"""Largest angular rate between two messages, rad/s. The range of the gyroscope is 35 rad/s."""
 _JOLT = 0.05
-"""Rotation that is permitted in addition, rad."""
+"""Additional rotation that is always permitted, rad."""
 _LEARNED = 10
-"""Number of intervals from which on the period is their mean; before, it is the shortest of
-them."""
+"""Number of intervals from which the period is their mean. With fewer intervals, the period is the
+shortest of them."""
 _LONGER = 20
-"""Consecutive intervals of the same number of periods that prove a changed rate."""
+"""Number of consecutive intervals with the same number of periods that prove a changed rate."""
 _MOST_COUNTED = 50
-"""Longest interval, periods, that contributes to the mean."""
+"""Longest interval that contributes to the mean, periods."""
 _PACE_NS = 250_000_000
-"""Largest difference, ns, of elapsed device and arrival time without a restart or a backlog."""
+"""Largest difference between elapsed device and arrival time without restart or backlog, ns."""
 _LATEST_NS = 30_000_000_000
-"""Longest delay, ns, of the first messages after opening."""
+"""Longest delay of the first messages after opening, ns."""
 
 
 class XImu3Point(NamedTuple):
@@ -73,15 +73,15 @@ class XImu3Step(NamedTuple):
     """Classification of one measurement."""
 
     lost: int = 0
-    """Number of messages lost before this one, or before the held one that it confirms."""
+    """Number of messages lost before this one, or before the held one if it is confirmed."""
     restarted: bool = False
-    """Whether the device restarted before the held one."""
+    """Whether the device restarted before the held message."""
     held: bool = False
-    """Whether this message is to be held until the next message."""
+    """Whether this message must be held until the next message."""
     confirmed: bool = False
-    """Whether the held one is valid and is returned first; otherwise it is dropped."""
+    """Whether the held message is valid and must be returned first; otherwise it is dropped."""
     lost_since: int = 0
-    """Number of messages lost between the confirmed one and this one."""
+    """Number of messages lost between the confirmed message and this message."""
 
 
 _CONTINUES = XImu3Step()
@@ -89,13 +89,13 @@ _HELD = XImu3Step(held=True)
 
 
 class XImu3Continuity:
-    """Tracks the measurements of one device."""
+    """Checks the measurements of one device."""
 
     def __init__(self) -> None:
         self.forget()
 
     def forget(self) -> None:
-        """Start again with the next message."""
+        """Discard the state, so that the next message is treated as the first."""
         self._last: XImu3Point | None = None
         self._before: XImu3Point | None = None
         self._held: XImu3Point | None = None
@@ -112,7 +112,7 @@ class XImu3Continuity:
         return self._sum_us / self._sum_periods if self._sum_periods >= _LEARNED else None
 
     def step(self, point: XImu3Point) -> XImu3Step:
-        """Return the step for a message with a measurement."""
+        """Return the classification of a message with a measurement."""
         last, held = self._last, self._held
         if last is None:
             self._last = point
@@ -129,7 +129,7 @@ class XImu3Continuity:
             self._held = point
             return _HELD
 
-        # `held` and `point` belong together: accept both.
+        # `held` and `point` belong together, so both are accepted.
         self._held = None
         advance_ns, elapsed_ns = (held.ticks - last.ticks) * 1000, held.arrival_ns - last.arrival_ns
         delay_ns = self._delay.limit(_PACE_NS, _LATEST_NS)
@@ -151,14 +151,14 @@ class XImu3Continuity:
         return self._deviation_of(last, point) <= allowed
 
     def _confirms(self, held: XImu3Point, point: XImu3Point) -> bool:
-        """Whether a message may be the next message after the held message."""
+        """Return whether a message may be the next message after the held message."""
         passed = point.ticks - held.ticks
         if not 0 <= passed <= (_FEW * self._period if self._period else _FIRST_US):
             return False
         if held.q is None or point.q is None:
             return True
 
-        # twice the chord is the angle between the orientations
+        # The angle between the orientations is twice the chord.
         sign = 1.0 if sum(a * b for a, b in zip(held.q, point.q, strict=True)) >= 0.0 else -1.0
         square = sum((a - sign * b) ** 2 for a, b in zip(held.q, point.q, strict=True))
         return 2.0 * sqrt(square) <= _FASTEST * 1e-6 * passed + _JOLT
@@ -188,7 +188,7 @@ class XImu3Continuity:
         return 2.0 * sqrt(w * w + x * x + y * y + z * z)
 
     def _accept(self, last: XImu3Point, point: XImu3Point) -> int:
-        """Store `point` as the last point; return the number of messages lost before."""
+        """Store `point` as the last point; return the number of messages lost before it."""
         passed = point.ticks - last.ticks
         self._delay.feed(passed * 1000, point.arrival_ns - last.arrival_ns)
         dropped, self._dropped = self._dropped, 0

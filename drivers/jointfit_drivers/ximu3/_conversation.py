@@ -1,6 +1,6 @@
-"""Commands to an x-IMU3 and its replies, which contain the key of the command.
+"""Exchange of commands with an x-IMU3. A reply contains the key of its command.
 
-A device sends measurements all the time; no command stops them.
+A device sends measurements continuously, and no command stops them.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ if TYPE_CHECKING:
     from jointfit_drivers.ports.serial_port import SerialPort
 
 REPLY_S = 0.5
-"""Longest wait for a reply, s: the time-out of the x-IMU3 GUI."""
+"""Longest wait for a reply, s, which equals the time-out of the x-IMU3 GUI."""
 TRIES = 3
-"""Number of times that a command is sent: the x-IMU3 GUI retries twice."""
+"""Number of times that a command is sent. The x-IMU3 GUI also sends it three times."""
 _CERTAIN = 3
-"""Messages with numbers that identify the protocol: a single one may be noise."""
+"""Number of messages with numbers that identify the protocol. A single message may be noise."""
 
 
 class XImu3Conversation:
-    """Commands and replies of one device on one port.
+    """Exchange of commands and replies with one device on one port.
 
     Parameters
     ----------
     port : SerialPort
         Open port.
     emit : Emit
-        Receives all bytes from the first reply on.
+        Function that receives all bytes from the first reply on.
     """
 
     def __init__(self, port: SerialPort, emit: Emit) -> None:
@@ -44,18 +44,18 @@ class XImu3Conversation:
 
     @property
     def understood(self) -> bool:
-        """Whether the bytes received so far certainly come from an x-IMU3."""
+        """Whether the received bytes certainly come from an x-IMU3."""
         return self._certain >= _CERTAIN
 
     def reset(self) -> None:
-        """Discard received bytes, here and in the port: for another speed or a new start."""
+        """Discard received bytes, here and in the port, for another speed or a new start."""
         self._line.reset()
         self._certain = 0
 
     async def request(
         self, key: str, value: object = None, *, tries: int = TRIES, wait_s: float = REPLY_S
     ) -> XImu3Reply | None:
-        """Send a command until its reply arrives; return None if none does."""
+        """Send a command until its reply arrives; return None if no reply arrives."""
 
         def is_reply(message: XImu3Data | XImu3Reply) -> bool:
             if isinstance(message, XImu3Data):

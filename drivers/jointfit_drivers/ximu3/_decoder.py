@@ -1,10 +1,10 @@
-"""Decoder of the x-IMU3 driver: chunks in, samples in SI units with canonical orientation out.
+"""Decoder of x-IMU3 devices: converts chunks to samples in SI units with canonical orientation.
 
-A sample is stamped with the arrival of its first byte. On a serial line this is the arrival of the
-chunk minus the duration of the message and of the bytes behind it, at ten bits per byte. On USB it
-is the arrival of the chunk.
+The stamp of a sample is the arrival of its first byte. On a serial line, this is the arrival of the
+chunk minus the duration of the message and of all later bytes in the chunk, at ten bits per byte.
+On USB, it is the arrival of the chunk.
 
-Invariant: the output depends only on the chunks fed; the decoder reads no clock and no port.
+Invariant: the output depends only on the chunks fed. The decoder reads no clock and no port.
 """
 
 from __future__ import annotations
@@ -40,22 +40,22 @@ if TYPE_CHECKING:
     from jointfit_protocols.corrupt import CorruptBytes
 
 _LATEST_TICKS = 1 << 52
-"""Device time, us, that is not plausible: 142 years."""
+"""Smallest implausible device time, us, equal to 142 years."""
 _RATE_TOLERANCE = 0.1
-"""Largest relative difference of the measured rate from ``rate_hz`` without a warning."""
+"""Largest relative difference between the measured rate and ``rate_hz`` without a warning."""
 _UNUSABLE = {
     DataKind.MATRIX: "rotation matrix is not orthonormal",
     DataKind.EULER: "Euler angles are not finite",
 }
 _NEWEST = NewestKnown((1,), "the x-IMU3 GUI")
-"""Firmware that the vendor's software of API 1.9 reads."""
+"""Newest supported firmware, which API 1.9 of the vendor's software reads."""
 _OLD_PULSE_US = 10_000_000
 _LONGEST_VERSION = 32
 """Largest difference, us, between an edge and the last measurement."""
 
 
 class _Measurement(NamedTuple):
-    """A message with a measurement that has not been classified yet."""
+    """A message with a measurement that is not classified yet."""
 
     message: XImu3Data
     arrived_ns: int
@@ -89,12 +89,12 @@ class XImu3Decoder(SerialMessageDecoder[XImu3Data | XImu3Reply]):
 
     @property
     def tick_clock(self) -> TickClock:
-        """Unit of the device time: microseconds since its start, without wrap."""
+        """Unit of the device time: microseconds since the device started, without wraps."""
         return TickClock(TICK_NS, None)
 
     @override
     def flush(self) -> list[Decoded]:
-        """Discard a pending message and a measurement that waits for confirmation."""
+        """Discard an incomplete message, and a measurement that waits for confirmation."""
         return super().flush() + self._drop_held()
 
     @override
@@ -120,7 +120,7 @@ class XImu3Decoder(SerialMessageDecoder[XImu3Data | XImu3Reply]):
         return out
 
     def _take_data(self, message: XImu3Data) -> list[Decoded]:
-        """Return the content of a data message of the device itself."""
+        """Return the content of a data message from the device itself."""
         if message.ticks >= _LATEST_TICKS:
             return [self._refusals.refuse(message.size, "device time out of range")]
 
@@ -141,7 +141,7 @@ class XImu3Decoder(SerialMessageDecoder[XImu3Data | XImu3Reply]):
         return self._reports.data_events(message)
 
     def _measure(self, message: XImu3Data, native: Quaternion | None) -> list[Decoded]:
-        """Return the samples that a measurement completes, after the check of time and motion."""
+        """Check time and motion of a measurement, and return the samples that it completes."""
         q = None
         if native is not None:
             q = self._gate.admit(canonical(native, self._reports.world))
@@ -149,7 +149,7 @@ class XImu3Decoder(SerialMessageDecoder[XImu3Data | XImu3Reply]):
                 out: list[Decoded] = [
                     self._refusals.refuse(message.size, "quaternion norm is not 1")
                 ]
-                # Warn once if hardly any quaternion has norm 1.
+                # Warn once if hardly any quaternion has the norm 1.
                 norm = None if self._norm_checked else self._gate.misconfigured_norm
                 if norm is not None:
                     self._norm_checked = True
@@ -183,7 +183,7 @@ class XImu3Decoder(SerialMessageDecoder[XImu3Data | XImu3Reply]):
         return out if self._rate_checked else out + self._rate_warning()
 
     def _sample(self, measured: _Measurement) -> list[Decoded]:
-        """Return the samples of an accepted measurement."""
+        """Return the samples that an accepted measurement completes."""
         message, arrived_ns, native, q = measured
         self._last_ticks = message.ticks
         if self._raw is not None:
@@ -196,7 +196,7 @@ class XImu3Decoder(SerialMessageDecoder[XImu3Data | XImu3Reply]):
         if native is None or q is None:
             return []
 
-        # A dropped quaternion may have changed the sign: continue with the sign of the last sample.
+        # A dropped quaternion may have changed the sign, so the sign of the last sample is used.
         (a, b, c, d), (w, x, y, z) = self._q, q
         if a * w + b * x + c * y + d * z < 0.0:
             q = (-w, -x, -y, -z)
@@ -204,7 +204,7 @@ class XImu3Decoder(SerialMessageDecoder[XImu3Data | XImu3Reply]):
         return [ImuSample(arrived_ns, q, native, message.ticks, None)]
 
     def _sync_pulse(self, message: XImu3Data) -> list[Decoded]:
-        """Return the pulse of an edge that counts."""
+        """Return the pulse of an edge that must be reported."""
         wire, edge = self._settings.sync_wire, message.values[0] != 0.0
         if wire is None or edge != (self._settings.sync_edge == "rising"):
             return []
@@ -217,7 +217,7 @@ class XImu3Decoder(SerialMessageDecoder[XImu3Data | XImu3Reply]):
         return [SyncPulse(self._arrival_of(message), message.ticks, wire)]
 
     def _rate_warning(self) -> list[Decoded]:
-        """Return a warning, once, if the device sends at another rate than configured."""
+        """Return a warning, once, if the rate of the device differs from the configured rate."""
         period_us = self._continuity.period_us
         if period_us is None:
             return []

@@ -1,4 +1,4 @@
-"""Properties, settings and messages of an x-IMU3 besides its measurements, as device events."""
+"""Conversion of an x-IMU3's properties, settings and messages to events, measurements excepted."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ if TYPE_CHECKING:
     from jointfit_protocols.ximu3 import XImu3Data, XImu3Reply
 
 WORLDS: tuple[World, ...] = ("NWU", "ENU", "NED")
-"""Worlds by the value of ``ahrs_axes_convention``."""
+"""World for each value of ``ahrs_axes_convention``."""
 ALIGNMENTS = (
     "+X+Y+Z", "+X-Z+Y", "+X-Y-Z", "+X+Z-Y", "-X+Y-Z", "-X+Z+Y", "-X-Y+Z", "-X-Z-Y",
     "+Y-X+Z", "+Y-Z-X", "+Y+X-Z", "+Y+Z+X", "-Y+X+Z", "-Y-Z+X", "-Y-X-Z", "-Y+Z-X",
     "+Z+Y-X", "+Z+X+Y", "+Z-Y+X", "+Z-X-Y", "-Z+Y+X", "-Z-X+Y", "-Z-Y-X", "-Z+X-Y",
 )  # fmt: skip
-"""Sensor axes that the body axes x, y and z equal, by the value of ``axes_alignment``."""
+"""Sensor axes that equal the body axes x, y and z, for each value of ``axes_alignment``."""
 _PROPERTIES = {
     "firmware_version": "firmware",
     "hardware_version": "hardware",
@@ -31,20 +31,20 @@ _SETTINGS = (
     "magnetometer_message_rate_divisor", "serial_mode", "ahrs_ignore_magnetometer",
 )  # fmt: skip
 _LOW_PERCENT = 10.0
-"""Charge of the battery, percent, below which a warning is returned."""
+"""Battery charge below which a warning is returned, percent."""
 _CHARGED_PERCENT = 20.0
-"""Charge above which the next warning is possible."""
+"""Battery charge above which the next warning is possible, percent."""
 _LONGEST_TEXT = 200
-"""Maximum number of characters of a text of the device in an event."""
+"""Largest number of characters of a device's text in an event."""
 
 
 class DeviceReports:
-    """State of one device that its messages report.
+    """State of one device, as reported by its messages.
 
     Parameters
     ----------
     world : {"NWU", "ENU", "NED"}
-        World until the device reports its own.
+        World that is assumed until the device reports its own.
     """
 
     def __init__(self, world: World) -> None:
@@ -53,7 +53,7 @@ class DeviceReports:
         self._world_known = self._low = False
 
     def reply_events(self, reply: XImu3Reply) -> list[Decoded]:
-        """Return the events of a reply to a command."""
+        """Return the events that a reply to a command causes."""
         key, value = reply.key, reply.value
         if reply.error is not None:
             text = f"command {_shown(key)} refused: {_shown(reply.error)}"
@@ -80,7 +80,7 @@ class DeviceReports:
         return _properties({key: value} if key in _SETTINGS and isinstance(value, int) else {})
 
     def data_events(self, message: XImu3Data) -> list[Decoded]:
-        """Return the events of a data message without measurement; most have none."""
+        """Return the events of a data message without measurement; most messages cause none."""
         text = _shown(message.text.decode("utf-8", "replace"))
         if message.kind == DataKind.ERROR:
             return [DeviceEvent("error", f"device reports: {text}", {"error": text})]
@@ -89,7 +89,7 @@ class DeviceReports:
         if message.kind != DataKind.BATTERY:
             return []
 
-        # Warn when the charge falls below the limit.
+        # Warn when the battery charge falls below the limit.
         percent = message.values[0]
         low = percent < (_CHARGED_PERCENT if self._low else _LOW_PERCENT)
         fell, self._low = low and not self._low, low
@@ -115,5 +115,5 @@ def _properties(known: dict[str, object]) -> list[Decoded]:
 
 
 def _shown(value: object) -> str:
-    """Return a value of the device as text of limited length."""
+    """Return a value that the device sent, as text of limited length."""
     return str(value)[:_LONGEST_TEXT]

@@ -1,7 +1,7 @@
 """Driver of x-io x-IMU3 on a serial port or USB, and of boards that send its messages.
 
 `XImu3Decoder` is the pure part. `XImu3Imu.run` opens the port, checks the settings of the device
-and reads until cancelled. `run` passes nothing but chunks to the decoder.
+and reads until cancelled. The decoder receives only the chunks that `run` emits.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class XImu3Imu:
-    """One x-IMU3: orientation, device time in microseconds."""
+    """One x-IMU3, which sends orientation and device time in microseconds."""
 
     Settings: ClassVar[type[XImu3Settings]] = XImu3Settings
     wire: ClassVar[Wire] = "stream"
@@ -42,8 +42,8 @@ class XImu3Imu:
         DeviceLostError
             The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            The file is not a serial port, the device uses another speed, no x-IMU3 answers, or its
-            settings differ while ``persist`` is false.
+            The file is not a serial port, or no x-IMU3 answers. Or the device uses another speed,
+            or its settings differ while ``persist`` is false.
         """
         settings = self._settings
 

@@ -1,8 +1,9 @@
-"""From an open port to an x-IMU3 with the required settings, or to the error that explains why not.
+"""Start of an x-IMU3: checks the required settings, or raises an error that explains the failure.
 
-The settings are read and compared. A setting is changed only where it differs and ``persist``
-allows the change, because the device also saves its settings when it is switched off. A fault that
-may clear by itself raises `DeviceLostError`, any other `DeviceMisconfiguredError`.
+The driver reads the settings of the device. It changes a setting only if the setting differs and
+``persist`` permits the change, because the device also saves its settings when it is switched off.
+A fault that may end without a change of the settings raises `DeviceLostError`. All other faults
+raise `DeviceMisconfiguredError`.
 """
 
 from __future__ import annotations
@@ -29,21 +30,21 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LINE_SPEEDS = (115_200, 921_600, 460_800, 230_400, 1_000_000, 2_000_000, 57_600, 38_400, 9_600)
-"""Line speeds to search, bit/s: the factory setting first."""
+"""Line speeds for the search, bit/s: factory setting first."""
 _LISTEN_S = 0.2
-"""Wait for a reply at each speed of the search, s."""
+"""Longest wait for a reply at each speed of the search, s."""
 _INTERFACES = {"USB": "usb", "Serial": "uart"}
-"""Names of the interface in the reply to a ping, and the transport of rig.toml."""
+"""Transport in rig.toml for each name of an interface in the reply to a ping."""
 _WORLDS = (0, 1, 2)
 
 
 class XImu3Handshake:
-    """Checks one device and configures it if that is allowed.
+    """Checks one device, and configures it if this is permitted.
 
     Parameters
     ----------
     port, emit : SerialPort, Emit
-        Open port, and the receiver of the device's bytes.
+        Open port, and function that receives the device's bytes.
     settings : XImu3Settings
         Table of the device in rig.toml.
     hunt : bool
@@ -61,21 +62,21 @@ class XImu3Handshake:
         self._required = required_settings(settings)
 
     async def ensure_configured(self) -> None:
-        """Return when the device sends the requested measurements.
+        """Return when the device sends the required measurements.
 
         Raises
         ------
         DeviceLostError
-            The device is silent, unplugged, or stopped answering.
+            The device does not answer, was unplugged, or stopped answering.
         DeviceMisconfiguredError
-            The device uses another speed, is of another kind, or its settings differ and may not be
-            written.
+            The device uses another speed or is of another kind. Or its settings differ and must not
+            be written.
         """
         settings = self._settings
         settings.require_line_speed("serial_baud_rate of the device")
 
-        # Bytes are emitted from the first reply on: the decoder needs the world of the orientations
-        # before the first of them.
+        # Bytes are emitted from the first reply on. The decoder must know the world before it
+        # receives the first orientation.
         self._conversation.reset()
         world = await self._conversation.request(WORLD)
         ping = None if world is None else await self._conversation.request("ping")
@@ -98,7 +99,7 @@ class XImu3Handshake:
         await self._ensure_settings(found)
 
     async def _read(self, keys: list[str]) -> dict[str, object]:
-        """Return the values of settings; a setting that the device refuses has none."""
+        """Return the values of settings; settings that the device refuses are missing."""
         found: dict[str, object] = {}
         refused = []
         for key in dict.fromkeys(keys):
@@ -119,7 +120,7 @@ class XImu3Handshake:
         return found
 
     async def _ensure_settings(self, found: dict[str, object]) -> None:
-        """Compare the settings, and write those that differ if that is allowed."""
+        """Compare the settings, and write those that differ if this is permitted."""
         faults = differences(found, self._required)
         if not faults:
             return
@@ -179,7 +180,7 @@ class XImu3Handshake:
         )
 
     async def _other_speed(self) -> int | None:
-        """Return the speed at which the device answers, or sends its messages."""
+        """Return the speed at which the device answers or sends messages; None if there is none."""
 
         async def answers() -> bool:
             reply = await self._conversation.request("ping", tries=1, wait_s=_LISTEN_S)

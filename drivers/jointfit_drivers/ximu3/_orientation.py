@@ -1,8 +1,8 @@
-r"""Orientation in the data messages of an x-IMU3: quaternion, rotation matrix or Euler angles.
+r"""Orientation in data messages of an x-IMU3: quaternion, rotation matrix or Euler angles.
 
 .. math:: R = R_z(\psi) R_y(\theta) R_x(\varphi), \qquad v_\mathrm{world} = R\, v_\mathrm{sensor}
 
-with yaw, pitch and roll in the order of the message: roll, pitch, yaw.
+with yaw ψ, pitch θ and roll φ. A message contains them in the order roll, pitch, yaw.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
 _ACCELERATIONS = (DataKind.LINEAR_ACCELERATION, DataKind.EARTH_ACCELERATION)
 _WITH_QUATERNION = 7
-"""Values of an acceleration message of older firmware."""
+"""Number of values in an acceleration message of older firmware."""
 _ORTHONORMAL = 0.02
-"""Largest error of the products of the columns of a rotation matrix."""
+"""Largest error of the products of the columns of a valid rotation matrix."""
 
 
 def is_orientation(message: XImu3Data) -> bool:
@@ -36,7 +36,7 @@ def is_orientation(message: XImu3Data) -> bool:
 def orientation_of(message: XImu3Data) -> Quaternion | None:
     """Return the quaternion of a message with an orientation, in the world of the device.
 
-    None if a rotation matrix is not orthonormal, or an Euler angle is not finite.
+    Return None if a rotation matrix is not orthonormal, or if an Euler angle is not finite.
     """
     values = message.values
     if message.kind == DataKind.MATRIX:
@@ -63,8 +63,8 @@ def _quaternion_of_matrix(rows: Sequence[float]) -> Quaternion | None:
     if not all(abs(value) <= _ORTHONORMAL for value in products) or not volume > 0.0:
         return None
 
-    # The largest of 4w², 4x², 4y², 4z² gives one component; the other components follow by
-    # division.
+    # The largest of 4w², 4x², 4y² and 4z² yields one component. The other components follow from
+    # divisions by this component.
     squares = (1.0 + xx + yy + zz, 1.0 + xx - yy - zz, 1.0 - xx + yy - zz, 1.0 - xx - yy + zz)
     largest = squares.index(max(squares))
     double = sqrt(squares[largest])

@@ -1,4 +1,4 @@
-"""First seconds of a device that receives no commands: its messages must be the expected ones."""
+"""Check of the first messages of a device to which the driver sends no commands."""
 
 from __future__ import annotations
 
@@ -16,20 +16,21 @@ if TYPE_CHECKING:
     from jointfit_drivers.ximu3._settings import XImu3Settings
 
 _LISTEN_S = 2.0
-"""Time to the first expected message, s; a device at 1 Hz sends two."""
+"""Longest wait for the first expected message, s. A device at 1 Hz sends two messages in it."""
 
 
 async def ensure_expected_messages(
     port: SerialPort, emit: Emit, settings: XImu3Settings, silence_s: float
 ) -> None:
-    """Emit all bytes and return at the first message with the expected measurement.
+    """Emit all bytes, and return at the first message with the expected measurement.
 
     Raises
     ------
     DeviceLostError
         No byte arrives for `silence_s`.
     DeviceMisconfiguredError
-        Bytes arrive, but no messages, or messages without the expected measurement.
+        Bytes arrive, but they contain no messages, or only messages without the expected
+        measurement.
     """
     codec, kinds = XImu3Codec(), Counter[str]()
     loop = asyncio.get_running_loop()

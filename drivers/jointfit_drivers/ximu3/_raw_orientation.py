@@ -1,9 +1,9 @@
-"""Orientation on the gateway from the inertial and magnetic messages of an x-IMU3.
+"""Computation of the orientation on the gateway, from the raw messages of an x-IMU3.
 
-The magnetometer is slower than the gyroscope and has messages of its own. Between them, the last
-field is rotated with the angular rate to the time of each inertial message.
+The magnetometer is slower than the gyroscope and has separate messages. Between two magnetic
+messages, the last field is rotated by the angular rate to the time of each inertial message.
 
-Invariant: the output depends only on the messages fed; no clock and no port is read.
+Invariant: the output depends only on the messages fed. The module reads no clock and no port.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from jointfit_protocols.ximu3 import XImu3Data
 
 STANDARD_GRAVITY = 9.80665
-"""Unit of specific force, m/s²."""
+"""Unit of the specific force, m/s²."""
 _DEGREE = radians(1.0)
 _OLDEST_US = 1_000_000
-"""Age of a field, us, above which it is not used: the magnetometer was switched off."""
+"""Age above which a field is not used, us, because the magnetometer was switched off."""
 
 
 class XImu3RawOrientation:
@@ -39,7 +39,7 @@ class XImu3RawOrientation:
     Parameters
     ----------
     make_samples : callable
-        Returns a new filter of raw measurements.
+        Function that returns a new filter of raw measurements.
     """
 
     def __init__(self, make_samples: Callable[[], RawSamples]) -> None:
@@ -51,14 +51,15 @@ class XImu3RawOrientation:
         self._field: Vector | None = None
 
     def forget(self) -> None:
-        """Start again: the device and its clock restarted."""
+        """Discard the state, because the device and its clock restarted."""
         self.__init__(self._make_samples)  # type: ignore[misc] # the state of a new filter
 
     def measure_field(self, message: XImu3Data) -> None:
         """Store the field of a magnetic message."""
         x, y, z = message.values
         if self._samples.magnetometer and x * x + y * y + z * z < _STRONGEST:  # False for NaN
-            # A hard-iron offset turns with the sensor: it is removed before the field is rotated.
+            # A hard-iron offset rotates with the sensor, so it is removed before the field is
+            # rotated.
             self._field = self._samples.correct_field((x, y, z))
             self._field_ticks = message.ticks
             self._measured_ticks = message.ticks
@@ -81,7 +82,7 @@ class XImu3RawOrientation:
         return self._samples.take(RawStamp(arrived_ns, ticks), reading, field_corrected=True)
 
     def _field_at(self, ticks: int, rate: Vector) -> Vector | None:
-        """Return the field at the time of an inertial message; None without a recent one."""
+        """Return the field at the time of an inertial message; None if there is no recent field."""
         if self._field is None or ticks - self._measured_ticks > _OLDEST_US:
             return None
         if self._samples.readings_only:  # each measured field once, as it was measured

@@ -1,4 +1,4 @@
-"""Settings that an x-IMU3 must have to send the measurements that rig.toml requests."""
+"""Settings that an x-IMU3 needs in order to send the measurements that rig.toml requests."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ WORLD = "ahrs_axes_convention"
 REPORTED = (
     "firmware_version", "hardware_version", WORLD, "axes_alignment", "ahrs_ignore_magnetometer",
 )  # fmt: skip
-"""Settings that are read because they change the meaning of the measurements."""
+"""Settings that are read because they affect the meaning of the measurements."""
 _SERIAL_MODES = ("disabled", "normal", "accessory")
 _MESSAGE_TYPES = (
     "quaternion", "rotation matrix", "Euler angles", "linear acceleration", "earth acceleration",
 )  # fmt: skip
 _MAGNETIC_DIVISORS = (1, 2)
-"""Divisors of the base rate of 20 Hz: the magnetometer sends at 20 or 10 Hz."""
+"""Divisors of the base rate of 20 Hz, with which the magnetometer sends at 20 or 10 Hz."""
 
 
 class RequiredSetting(NamedTuple):
@@ -30,7 +30,7 @@ class RequiredSetting(NamedTuple):
 
     key: str
     values: tuple[object, ...]
-    """Acceptable values; the driver writes the first value if the device has none of these."""
+    """Acceptable values. If the device has none of them, the driver writes the first."""
 
 
 def required_settings(settings: XImu3Settings) -> tuple[RequiredSetting, ...]:
@@ -69,7 +69,7 @@ def required_settings(settings: XImu3Settings) -> tuple[RequiredSetting, ...]:
 def differences(
     found: Mapping[str, object], required: tuple[RequiredSetting, ...]
 ) -> dict[str, str]:
-    """Return the description of each setting that differs, by key."""
+    """Return a description of each setting that differs, by key."""
     return {
         key: f"{key} is {describe_value(key, found.get(key))}, expected "
         f"{describe_value(key, values[0])}"
@@ -83,7 +83,7 @@ def differences(
 
 
 def rate_hint(found: Mapping[str, object], required: tuple[RequiredSetting, ...]) -> str:
-    """Return a hint at the device's own rate, where that alone resolves the differences."""
+    """Return a hint to the device's own rate, if this rate alone resolves the differences."""
     faults = differences(found, required)
     key = next(iter(faults), "")
     divisor = found.get(key)
@@ -93,7 +93,7 @@ def rate_hint(found: Mapping[str, object], required: tuple[RequiredSetting, ...]
 
 
 def describe_value(key: str, value: object) -> str:
-    """Return a value with its meaning."""
+    """Return a value of a setting as text with its meaning."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, int):
@@ -106,4 +106,4 @@ def describe_value(key: str, value: object) -> str:
 
 
 _RATES = ("ahrs_message_rate_divisor", "inertial_message_rate_divisor")
-"""Settings whose value divides the base rate."""
+"""Settings whose values are divisors of the base rate."""

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 _QUATERNION_BYTES, _INERTIAL_BYTES, _MAGNETIC_BYTES = 26, 34, 22
-"""Binary messages without escapes."""
+"""Sizes of binary messages without escapes, bytes."""
 _MAGNETIC_HZ = 20
-"""Rate of the magnetometer."""
+"""Rate of the magnetometer, Hz."""
 
 
 class XImu3Settings(GatewaySettings, SerialImuSettings):
@@ -64,7 +64,7 @@ class XImu3Settings(GatewaySettings, SerialImuSettings):
 
     @override
     def contradictions(self) -> Iterator[tuple[str, str]]:
-        """Refuse rates that the device does not have, and settings that `passive` cannot check."""
+        """Yield rates that the device does not support, and keys that `passive` cannot check."""
         rate_hz: float | None = self.rate_hz  # None: cannot be read
         passive: bool | None = self.passive
         if rate_hz is not None and passive is False and rate_divisor(rate_hz) is None:
@@ -83,17 +83,18 @@ class XImu3Settings(GatewaySettings, SerialImuSettings):
 
 
 def rate_divisor(rate_hz: float) -> int | None:
-    """Return the divisor of the base rate for an output rate; None if there is none."""
+    """Return the divisor of the base rate for an output rate; None if no divisor fits."""
     divisor = round(BASE_RATE_HZ / rate_hz)
     exact = divisor >= 1 and abs(divisor * rate_hz / BASE_RATE_HZ - 1.0) < _TOLERANCE
     return divisor if exact else None
 
 
 def nearest_divisors(rate_hz: float) -> tuple[int, int]:
-    """Return the divisors of the next higher and the next lower rate."""
+    """Return the divisors for the next higher and the next lower possible rate."""
     divisor = max(int(BASE_RATE_HZ / rate_hz), 1)
     return divisor, divisor + 1 if rate_hz < BASE_RATE_HZ else divisor
 
 
 _TOLERANCE = 1e-3
-"""Relative difference between a configured rate and a fraction of the base rate: 133.3 is 400/3."""
+"""Largest relative difference between a configured rate and a fraction of the base rate, so that
+133.3 means 400/3."""

@@ -1,4 +1,4 @@
-"""Bosch / CEVA BNO085 and BNO086 on a UART: RVC frames, SHTP packets and sensor reports."""
+"""Wire format of Bosch / CEVA BNO085 and BNO086 on a UART: RVC frames, SHTP packets and reports."""
 
 from jointfit_protocols.bno085._reports import (
     ACCURACY,

@@ -1,4 +1,4 @@
-"""Reports of the sensor hub SH-2, in both directions.
+"""Reports of the sensor hub software SH-2, in both directions.
 
 | report                        | bytes | values                            | unit of a count   |
 |-------------------------------|-------|-----------------------------------|-------------------|
@@ -11,13 +11,14 @@
 | 08, 29 game rotation vector   | 12    | i j k real                        | 2^-14             |
 | 2A gyro rotation vector       | 14    | i j k real, rate x y z            | 2^-14, 2^-10 rad/s|
 
-A sensor report begins with id, sequence, status (bits 0..1 accuracy, bits 2..7 high bits of the
-delay) and delay. A packet begins with FB, the time between its transmission and a base, both in
-units of 100 us: a report was measured at transmission - base + delay. FA shifts the base.
-Gyro rotation vectors have a channel of their own, and consist of their values alone.
+A sensor report begins with four fields: id, sequence, status and delay. Bits 0..1 of the status are
+the accuracy, and bits 2..7 are the high bits of the delay. A packet begins with report FB, which
+contains the time between a base and the transmission of the packet. This time and the delay are in
+units of 100 us. The time of measurement is transmission - base + delay. The report FA shifts the
+base. Gyro rotation vectors are sent on a separate channel and consist only of their values.
 
-Sources: SH-2 reference manual 1000-3625; the vendor's host library (sh2, Apache-2.0), for lengths
-and the sign of times.
+Sources: SH-2 reference manual 1000-3625. Lengths and the sign of times are from the vendor's host
+library (sh2, Apache-2.0).
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ from typing import NamedTuple
 TICK_NS = 100_000
 """Unit of base times and delays, ns."""
 ACCURACY = ("unreliable", "low", "medium", "high")
-"""Names of the accuracy, bits 0 and 1 of the status."""
+"""Names of the accuracy levels in bits 0 and 1 of the status."""
 _HEAD = 4
 _MOST_DELAY = (1 << 14) - 1
 
 
 class HubReportId(IntEnum):
-    """First byte of reports."""
+    """Ids of reports, which are their first byte."""
 
     ACCELEROMETER = 0x01
     GYROSCOPE = 0x02
@@ -78,7 +79,7 @@ _SCALES: dict[int, tuple[float, ...]] = {
     HubReportId.GAME_ROTATION_VECTOR: (_Q14,) * 4,
     HubReportId.ARVR_GAME_ROTATION_VECTOR: (_Q14,) * 4,
 }
-"""Values of one count of each field, SI."""
+"""SI value of one count, for each field of each report."""
 _LENGTHS: dict[int, int] = {
     0x01: 10, 0x02: 10, 0x03: 10, 0x04: 10, 0x05: 14, 0x06: 10, 0x07: 16, 0x08: 12, 0x09: 14,
     0x0A: 8, 0x0B: 8, 0x0C: 6, 0x0D: 6, 0x0E: 6, 0x0F: 16, 0x10: 5, 0x11: 12, 0x12: 6, 0x13: 6,
@@ -97,21 +98,21 @@ _PRODUCT = struct.Struct("<BBBBIIHH")
 
 
 class HubReport(NamedTuple):
-    """One measurement."""
+    """One measurement of a sensor."""
 
     report_id: int
     sequence: int
-    """Number of the report of this sensor, modulo 256."""
+    """Sequence number of the report for this sensor, modulo 256."""
     status: int
-    """Bits 0 and 1: accuracy."""
+    """Status of the report; bits 0 and 1 are the accuracy."""
     delay: int
     """Time from the base to the measurement, 100 us."""
     values: tuple[float, ...]
-    """Measured values in SI units, in the order of the table above."""
+    """Measured values in SI units, in the order of the table at the top of this module."""
 
 
 def split_reports(payload: bytes) -> list[bytes] | None:
-    """Return the reports of a packet; None if they do not fill it or one is not known."""
+    """Return the reports of a packet; None if they do not fill it or if one is unknown."""
     reports, at, end = [], 0, len(payload)
     while at < end:
         size = _LENGTHS.get(payload[at])
@@ -134,7 +135,10 @@ def unknown_report(payload: bytes) -> int | None:
 
 
 def decode_report(report: bytes) -> HubReport | None:
-    """Return a measurement; None for other reports, of the length that `split_reports` ensures."""
+    """Return a measurement; None for other reports.
+
+    `split_reports` must have checked the length.
+    """
     kind = report[0]
     scales = _SCALES.get(kind)
     if scales is None:
@@ -165,7 +169,7 @@ def encode_gyro_rotation(values: tuple[float, ...]) -> bytes:
 
 
 def encode_report(report: HubReport) -> bytes:
-    """Return a measurement as bytes; values out of range are limited."""
+    """Return a measurement as bytes. Values out of range are clipped."""
     scales = _SCALES[report.report_id]
     counts = [round(v / s) for v, s in zip(report.values, scales, strict=True)]
     limited = [max(-32768, min(32767, count)) for count in counts]
@@ -177,7 +181,7 @@ def encode_report(report: HubReport) -> bytes:
 
 
 def base_time(report: bytes) -> int | None:
-    """Return the shift of the base by FB or FA, 100 us; None for other reports."""
+    """Return the shift of the base by a report FB or FA, 100 us; None for other reports."""
     if report[0] not in {HubReportId.BASE_TIME, HubReportId.TIME_REBASE}:
         return None
     kind, value = _BASE.unpack(report)
@@ -186,7 +190,7 @@ def base_time(report: bytes) -> int | None:
 
 
 def encode_base_time(age: int) -> bytes:
-    """Return FB: the base was `age` units of 100 us before transmission."""
+    """Return a report FB, which states that the base was `age` × 100 us before transmission."""
     return _BASE.pack(HubReportId.BASE_TIME, age)
 
 
@@ -201,16 +205,16 @@ def feature_request(report_id: int) -> bytes:
 
 
 def encode_feature(report_id: int, interval_us: int, *, response: bool = False) -> bytes:
-    """Return the command that sets the interval of a report, us, or the response with the interval.
+    """Return the command that sets the interval of a report, us, or the response to it.
 
-    An interval of 0 turns the report off. The settings are lost at a reset.
+    An interval of 0 switches the report off. The settings are lost at a reset.
     """
     kind = HubReportId.FEATURE_RESPONSE if response else HubReportId.SET_FEATURE
     return _FEATURE.pack(kind, report_id, 0, 0, interval_us, 0, 0)
 
 
 def decode_interval(report: bytes) -> tuple[int, int] | None:
-    """Return report and interval, us, of a feature report; None for other bytes."""
+    """Return the report id and the interval, us, of a feature report; None for other bytes."""
     if len(report) != _FEATURE.size or report[0] not in {
         HubReportId.FEATURE_RESPONSE,
         HubReportId.SET_FEATURE,

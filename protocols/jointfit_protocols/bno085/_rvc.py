@@ -1,13 +1,14 @@
-"""Frames of the mode UART-RVC: 100 per second at 115200 baud, without any command.
+"""Frames of the mode UART-RVC, which a device sends 100 times per second without any command.
 
  0    1    2       3 .. 8                9 .. 14         15 .. 17   18
 | AA | AA | index | yaw, pitch, roll | acceleration xyz | reserved | sum of bytes 2..17 mod 256 |
 
-Angles are int16 in 0.01 degrees, accelerations int16 in 1/1000 g, little-endian.
+The line speed is 115200 baud. Angles are int16 in 0.01 degrees, and accelerations are int16 in
+1/1000 g, little-endian.
 
 Source: BNO080 data sheet 1000-3927, section 1.3.5.2.
 
-Invariant: bytes in, frames out; no port, no clock.
+Invariant: the codec converts bytes to frames. It uses no port and no clock.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _MARKS = b"\xaa\xaa"
 _BODY = struct.Struct("<B6h3s")
 _unpack, _new_tuple = _BODY.unpack_from, tuple.__new__
 _RUN = 1024
-"""Number of noise bytes after which a run is reported, so that the sum of corrupt bytes is
+"""Number of noise bytes after which a run is reported, so that the number of corrupt bytes is
 current."""
 _START = re.compile(b"\xaa")
 _NO_START = CorruptBytes(1, "no frame starts here")
@@ -46,23 +47,23 @@ class RvcFrame(NamedTuple):
     """Specific force along x, y, z, 1/1000 g."""
     reserved: bytes = bytes(3)
     end: int = 0
-    """Number of bytes fed to the codec up to and including the checksum, for back-dating of the
+    """Number of bytes fed to the codec until the end of the checksum, for back-dating of the
     message."""
 
     @property
     def size(self) -> int:
-        """Length on the wire, bytes."""
+        """Length of the frame on the wire, bytes."""
         return RVC_BYTES
 
 
 def encode_rvc(frame: RvcFrame) -> bytes:
-    """Return the frame on the wire."""
+    """Return the bytes of a frame on the wire."""
     body = _BODY.pack(frame.number, *frame.angles, *frame.acceleration, frame.reserved)
     return bytes((_MARK, _MARK)) + body + bytes((sum(body) & 0xFF,))
 
 
 def _read_frame(buffer: bytes, at: int, base: int) -> RvcFrame | CorruptBytes | None:
-    """Return the frame that begins at `at`, the reason why none does, or None if it is cut."""
+    """Return the frame at `at`, the reason why there is none, or None if it is incomplete."""
     after = at + RVC_BYTES
     if after > len(buffer):
         return None if buffer[at] == _MARK else _NO_START
@@ -76,17 +77,17 @@ def _read_frame(buffer: bytes, at: int, base: int) -> RvcFrame | CorruptBytes | 
 
 
 class RvcCodec(ResynchronizingCodec[RvcFrame]):
-    """Decoder of pieces of any size to frames; the result does not depend on the pieces.
+    """Codec that converts byte strings of any size to frames; their boundaries do not matter.
 
-    Runs of corrupt bytes are reported at the latest every 1024 bytes.
+    Runs of corrupt bytes are reported after at most 1024 bytes.
     """
 
     def __init__(self) -> None:
         super().__init__(_read_frame, _START, _RUN, _NO_START.reason, RVC_BYTES)
 
     def feed(self, data: bytes) -> list[RvcFrame | CorruptBytes]:  # type: ignore[explicit-override]  # Python 3.12's
-        """Return the frames that `data` completed, in wire order; never raises."""
-        # The usual piece is one frame, which needs no search.
+        """Return the frames that `data` completes, in wire order; never raise."""
+        # Usually `data` is exactly one frame, which requires no search.
         if len(data) == RVC_BYTES and not self._pending and not self._run.count:
             found = _read_frame(data, 0, self.fed)
             if type(found) is RvcFrame:

@@ -1,18 +1,18 @@
-"""Packets of SHTP over UART (mode UART-SHTP, 3 Mbaud).
+"""Packets of the Sensor Hub Transport Protocol (SHTP) over UART (mode UART-SHTP, 3 Mbaud).
 
     7E | 01 | length, 2 bytes | channel | sequence | payload ... | 7E      packet
     7E | 00 | available, 2 bytes | 7E                                     buffer status
     7E | 00 | 7E                                                          query of the status
 
-7E and 7D inside are sent as 7D and the byte with bit 5 inverted. The length includes its own four
-bytes of header; bit 15 marks a continuation. There is no checksum: a packet is valid if its length
-field agrees with the length of the frame. Adjacent frames may share a flag. Numbers are
-little-endian.
+Inside a frame, 7E and 7D are sent as 7D followed by the byte with bit 5 inverted. The length
+includes its own four bytes of header, and its bit 15 marks a continuation. There is no checksum. A
+packet is valid if its length field agrees with the length of the frame. Adjacent frames may share a
+flag (7E). Numbers are little-endian.
 
-Sources: BNO08X data sheet 1000-3927, section 1.3.1; SH-2 SHTP reference manual 1000-3600; the
-vendor's host library (sh2, Apache-2.0), for the control protocol.
+Sources: BNO08X data sheet 1000-3927, section 1.3.1; SH-2 SHTP reference manual 1000-3600; for the
+control protocol, the vendor's host library (sh2, Apache-2.0).
 
-Invariant: bytes in, packets out; no port, no clock.
+Invariant: the codec converts bytes to packets. It uses no port and no clock.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ _LENGTH = 0x7FFF
 _HEAD = 1 + _HEADER.size
 _STATUS_BYTES = 3
 MOST_PAYLOAD = 2044
-"""Longest payload that is accepted, bytes; the longest known one is an advertisement of 276. It
-bounds the wait after a lost flag."""
+"""Longest accepted payload, bytes. The longest known payload is an advertisement of 276 bytes. The
+limit bounds the wait after a lost flag."""
 _MOST_SEGMENT = 2 * (_HEAD + MOST_PAYLOAD)
-"""Longest frame with every byte escaped, bytes."""
+"""Longest frame if every byte is escaped, bytes."""
 
 
 class ShtpChannel(IntEnum):
     """Channels of the sensor hub."""
 
     COMMAND = 0
-    """Advertisement after a reset."""
+    """Advertisement that the device sends after a reset."""
     EXECUTABLE = 1
     CONTROL = 2
     """Requests and their replies."""
@@ -53,21 +53,21 @@ class ShtpChannel(IntEnum):
 
 
 class ShtpPacket(NamedTuple):
-    """One packet whose length field agrees with the length of the frame."""
+    """One packet whose length field agrees with the length of its frame."""
 
     channel: int
     sequence: int
-    """Number of the packet on its channel and direction, modulo 256."""
+    """Sequence number of the packet for its channel and direction, modulo 256."""
     payload: bytes
     size: int = 0
-    """Length on the wire including both flags, bytes."""
+    """Length on the wire, including both flags, bytes."""
     end: int = 0
-    """Number of bytes fed to the codec up to and including the closing flag, for back-dating of the
+    """Number of bytes fed to the codec until the end of the closing flag, for back-dating of the
     message."""
 
 
 class ShtpBufferStatus(NamedTuple):
-    """Answer to a query: number of bytes that the device accepts now."""
+    """Answer to a query, with the number of bytes that the device accepts now."""
 
     available: int
     size: int = 0
@@ -78,7 +78,7 @@ Shtp = ShtpPacket | ShtpBufferStatus | CorruptBytes
 
 
 def encode_shtp(channel: int, sequence: int, payload: bytes) -> bytes:
-    """Return a packet on the wire, with both flags.
+    """Return the bytes of a packet on the wire, including both flags.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def encode_shtp(channel: int, sequence: int, payload: bytes) -> bytes:
 
 
 def encode_status(available: int | None) -> bytes:
-    """Return a buffer status on the wire; of None, the query for it."""
+    """Return a buffer status on the wire; if `available` is None, return the query for it."""
     return _framed(_CONTROL, b"" if available is None else available.to_bytes(2, "little"))
 
 
@@ -103,9 +103,9 @@ def _framed(protocol: int, data: bytes) -> bytes:
 
 
 class ShtpCodec:
-    """Decoder of pieces of any size to packets; the result does not depend on the pieces.
+    """Codec that converts byte strings of any size to packets; their boundaries do not matter.
 
-    Bytes between two flags that form no packet become one `CorruptBytes`. Flags are counted
+    If the bytes between two flags form no packet, they become one `CorruptBytes`. Flags are counted
     separately.
     """
 
@@ -116,11 +116,11 @@ class ShtpCodec:
         self.fed = 0
         """Number of bytes fed so far."""
         self.messages = 0
-        """Packets so far."""
+        """Number of packets so far."""
         self.statuses = 0
-        """Buffer statuses so far."""
+        """Number of buffer statuses so far."""
         self.flags = 0
-        """Flags so far."""
+        """Number of flags so far."""
         self.discarded = 0
         """Number of bytes so far that belong to no packet."""
 
@@ -130,7 +130,7 @@ class ShtpCodec:
         return len(self._pending)
 
     def feed(self, data: bytes) -> list[Shtp]:
-        """Return the packets that `data` completed, in wire order; never raises."""
+        """Return the packets that `data` completes, in wire order; never raise."""
         *segments, rest = (self._pending + data).split(_FLAG)
         end = self.fed - len(self._pending)
         self.fed += len(data)
@@ -150,7 +150,7 @@ class ShtpCodec:
         return found
 
     def flush(self) -> list[Shtp]:
-        """Discard an incomplete frame: its end was lost."""
+        """Discard an incomplete frame, because its end was lost."""
         pending, self._pending = len(self._pending), b""
         self._lost_flag = self._lost_flag or pending > 0
         return [self._corrupt(pending, "cut off")] if pending else []
@@ -180,7 +180,7 @@ class ShtpCodec:
 
 
 def _unescape(segment: bytes) -> bytes | None:
-    """Return the bytes of a frame; None if an escape ends it or is escaped itself."""
+    """Return the bytes of a frame; None if an escape is at the end or escapes an escape."""
     if ESCAPE not in segment:
         return segment
     first, *rest = segment.split(_ESCAPE)

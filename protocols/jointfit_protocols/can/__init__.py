@@ -1,4 +1,4 @@
-"""CAN frames: records, error frames and the SLCAN adapter protocol."""
+"""CAN frames: records, error frames, and the protocol of SLCAN adapters."""
 
 from jointfit_protocols.can._error_frame import describe_error
 from jointfit_protocols.can._frame import (

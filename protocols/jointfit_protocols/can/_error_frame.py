@@ -1,8 +1,8 @@
 """Descriptions of CAN error frames in Linux's layout (linux/can/error.h).
 
-An error frame was never on the wire: the controller or its driver generates it.
+An error frame is never sent on the bus. The controller or its driver generates it.
 
-Invariant: every content yields a description.
+Invariant: every error frame has a description.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ class CanError(NamedTuple):
 
     text: str
     serious: bool
-    """Communication has stopped, or is about to stop."""
+    """Whether communication has stopped or is about to stop."""
 
 
 def describe_error(frame: CanFrame) -> CanError:
-    """Return the description of error frame `frame`; unknown classes are named by number."""
+    """Return the description of the error frame `frame`; unknown classes are listed by number."""
     found = [text for bit, text in _CLASSES if frame.can_id & bit]
 
     serious = bool(frame.can_id & _SERIOUS)

@@ -1,17 +1,20 @@
-"""CAN frames as fixed-size records: the `Chunk.data` of a driver with ``wire = "can"``.
+"""CAN frames as records of fixed size, which form the data of a CAN chunk.
 
-A record has 24 bytes and contains the stamp of its frame. A chunk of many frames therefore contains
-all stamps, and a recording of chunks replays exactly.
+A driver with ``wire = "can"`` receives such chunks. A record has 24 bytes and contains the stamp of
+its frame. A chunk with many frames therefore contains all stamps, and a recording of chunks can be
+replayed exactly.
 
      0        8          12      13     14    16         24
     | t_ns i64 | id u32   | flags | size | zero | data[8] |   little-endian
 
     flags: 1 extended (29-bit), 2 remote request, 4 error frame
 
-Error frames have Linux's layout (linux/can/error.h): the identifier is a set of error classes. Two
-classes that Linux does not use contain notes of the host, see `host_dropped` and `host_corrupt`.
+Error frames have the layout of Linux (linux/can/error.h), in which the identifier is a set of error
+classes. This project uses two classes that Linux does not use for notes of the host; see
+`host_dropped` and `host_corrupt`.
 
-Invariant: unpacking never raises; a record that is no CAN frame becomes `CorruptBytes`.
+Invariant: unpacking never raises an exception. A record that is not a CAN frame becomes
+`CorruptBytes`.
 """
 
 from __future__ import annotations
@@ -28,9 +31,11 @@ RECORD_BYTES = 24
 STANDARD_MAX = 0x7FF
 EXTENDED_MAX = 0x1FFF_FFFF
 HOST_DROPPED = 1 << 28
-"""Error class of this project: the host lost frames; data is their number, u64 little-endian."""
+"""Error class of this project: the host lost frames. The data are their number, u64
+little-endian."""
 HOST_CORRUPT = 1 << 27
-"""Error class of this project: bytes of an adapter's line without a frame; data is their number."""
+"""Error class of this project: bytes of an adapter's line without a frame. The data are their
+number."""
 
 _RECORD = struct.Struct("<qIBBxx8s")
 _COUNT = struct.Struct("<Q")
@@ -42,17 +47,18 @@ class CanFrame(NamedTuple):
     """One classic CAN frame."""
 
     t_ns: int
-    """Host CLOCK_MONOTONIC at the start of the frame, ns, as exactly as it is known."""
+    """Host CLOCK_MONOTONIC at the start of the frame, ns, as accurate as it is known."""
     can_id: int
-    """Identifier; the error classes of an error frame."""
+    """Identifier of the frame. In an error frame, it contains the error classes."""
     data: bytes
     """Data bytes, at most 8."""
     extended: bool = False
     """Whether the identifier has 29 bits."""
     error: bool = False
-    """An error frame of the controller or a note of the host, not a frame from the wire."""
+    """Whether this is an error frame of the controller or a note of the host, not a frame on the
+    bus."""
     remote: bool = False
-    """A remote request, which has no data."""
+    """Whether this is a remote request, which has no data."""
 
 
 def pack_frames(frames: Iterable[CanFrame]) -> bytes:
@@ -61,7 +67,7 @@ def pack_frames(frames: Iterable[CanFrame]) -> bytes:
     Raises
     ------
     ValueError
-        A frame with more than 8 bytes of data.
+        A frame has more than 8 bytes of data.
     """
     pack = _RECORD.pack
     records = []
@@ -76,11 +82,11 @@ def pack_frames(frames: Iterable[CanFrame]) -> bytes:
 
 
 def unpack_frames(data: bytes) -> list[CanFrame | CorruptBytes]:
-    """Return the frames of the records in `data`; accepts any bytes.
+    """Return the frames in the records in `data`, which may be any bytes.
 
-    A record that `pack_frames` cannot have written is corrupt with 24 bytes, and unpacking
-    continues with the next one. An incomplete last record is corrupt too, because chunks contain
-    complete records.
+    A record that `pack_frames` cannot have written becomes 24 corrupt bytes, and unpacking
+    continues with the next record. An incomplete last record is corrupt as well, because chunks
+    contain only complete records.
     """
     found: list[CanFrame | CorruptBytes] = []
     whole = len(data) - len(data) % RECORD_BYTES
@@ -112,23 +118,24 @@ def unpack_frames(data: bytes) -> list[CanFrame | CorruptBytes]:
 
 
 def host_dropped(t_ns: int, count: int) -> CanFrame:
-    """Return the note that the host lost `count` frames (receive queue full) before `t_ns`."""
+    """Return the note that the host lost `count` frames before `t_ns` (receive queue full)."""
     return CanFrame(t_ns, HOST_DROPPED, _COUNT.pack(count), error=True)
 
 
 def host_corrupt(t_ns: int, count: int) -> CanFrame:
-    """Return the note that `count` bytes of an adapter's line were no frame."""
+    """Return the note that `count` bytes on an adapter's line formed no frame."""
     return CanFrame(t_ns, HOST_CORRUPT, _COUNT.pack(count), error=True)
 
 
 def host_count(frame: CanFrame) -> int:
-    """Return the number in a note of `host_dropped` or `host_corrupt`; 0 if it has none."""
+    """Return the number in a note of `host_dropped` or `host_corrupt`; 0 if there is none."""
     return int(_COUNT.unpack(frame.data)[0]) if len(frame.data) == _COUNT.size else 0
 
 
 def frame_bits(size: int, extended: bool) -> int:
-    """Return the length of a frame on the wire, bits, without stuff bits (they depend on content).
+    """Return the length of a frame on the bus, bits, without the stuff bits.
 
-    47 + 8 n with an 11-bit identifier, 67 + 8 n with a 29-bit one, interframe space included.
+    The length is 47 + 8 n with an 11-bit identifier and 67 + 8 n with a 29-bit identifier,
+    including the interframe space. The number of stuff bits depends on the content.
     """
     return (67 if extended else 47) + 8 * size

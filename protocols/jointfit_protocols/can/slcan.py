@@ -1,20 +1,21 @@
-"""SLCAN (Lawicel): CAN frames as lines of ASCII on a serial port, for host and adapter.
+"""SLCAN (Lawicel): CAN frames as ASCII lines on a serial port, for host and adapter.
 
-Stamps are computed from the arrival that the caller passes. On a serial line, a frame is back-dated
-by the duration of its characters and of those behind it. On USB, characters take no time. Frames of
-one read are then back-dated by their duration on the bus, where they follow each other.
+The stamps of frames are computed from the arrival time that the caller passes. On a serial line,
+the duration of the frame's characters and of all later characters is subtracted from the arrival.
+On USB, characters have no duration. The duration of the frames on the bus, where they follow each
+other, is then subtracted instead.
 
     t iii l dd...    11-bit frame, l bytes     T iiiiiiii l dd...   29-bit frame
     r iii l          11-bit remote request     R iiiiiiii l         29-bit remote request
 
-Every line ends in CR (LF is ignored). Four digits of adapter time may follow a frame, ms modulo
-60 000; they belong to another clock and are dropped. The adapter answers a command with CR
-(done) or BELL (refused). The host's commands are ``Sn`` (bit rate), ``O``, ``C``, ``V``, ``N``,
-``Z`` and others.
+Every line ends with CR; LF is ignored. A frame may be followed by four digits of adapter time in
+ms, modulo 60 000. The digits are dropped, because they refer to another clock. The adapter answers
+a command with CR (done) or BELL (refused). The commands of the host include ``Sn`` (bit rate),
+``O`` (open), ``C`` (close), ``V``, ``N`` and ``Z``.
 
 Source: Lawicel CAN232 manual, version 3.
 
-Invariant: bytes in, frames and lines out; no port, no clock.
+Invariant: the codec converts bytes to frames and lines. It uses no port and no clock.
 """
 
 from __future__ import annotations
@@ -26,20 +27,20 @@ from jointfit_protocols.can._frame import EXTENDED_MAX, STANDARD_MAX, CanFrame, 
 from jointfit_protocols.corrupt import CorruptBytes
 
 Role = Literal["host", "adapter"]
-"""Role of the decoder: the host reads answers, the adapter reads commands; both read frames."""
+"""Role of the codec. A host reads answers, and an adapter reads commands; both read frames."""
 
 BITRATES = (10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000)
-"""Bit rates of the commands S0 to S8, bit/s."""
+"""Bit rates that the commands S0 to S8 select, bit/s."""
 
 DONE, REFUSED = b"\r", b"\a"
 _BELL = 0x07
 _LONGEST = 64
-"""Characters of the longest line; some adapters have long version strings."""
+"""Number of characters of the longest line. Some adapters have long version strings."""
 _WINDOW = 32
-"""Characters at the end of a broken line that are searched for a frame; the longest frame has 30.
-"""
+"""Number of characters at the end of a corrupt line that are searched for a frame. The longest
+frame has 30."""
 _BITS_A_CHARACTER = 10
-"""Bits of one character on the line, 8N1."""
+"""Number of bits of one character on the line (8N1)."""
 
 # Letters of lines without a frame, and the permitted lengths of their arguments.
 _ANSWERS: dict[int, range] = {
@@ -60,15 +61,19 @@ _COMMANDS: dict[int, range] = {
 
 
 class SlcanLine(NamedTuple):
-    """A line without a frame: an answer or a command."""
+    """A line that contains no frame but an answer or a command."""
 
     letter: str
-    """First letter of the line; ``""`` for a bare CR (done), ``"\\a"`` for BELL (refused)."""
+    """First letter of the line. ``""`` means a single CR (done), and ``"\\a"`` means BELL
+    (refused)."""
     argument: str = ""
 
 
 def encode_frame(frame: CanFrame, time_ms: int | None = None) -> bytes:
-    """Return `frame` as a line, with `time_ms` modulo 60 000 as its adapter time if given."""
+    """Return `frame` as a line.
+
+    If `time_ms` is given, it is added modulo 60 000 as adapter time.
+    """
     letter = ("rR" if frame.remote else "tT")[frame.extended]
 
     head = f"{letter}{frame.can_id:0{8 if frame.extended else 3}X}{len(frame.data)}"
@@ -78,11 +83,12 @@ def encode_frame(frame: CanFrame, time_ms: int | None = None) -> bytes:
 
 
 def _frame(line: bytes, t_ns: int) -> CanFrame | None:
-    """Return the frame that fills `line` (without CR), or None."""
+    """Return the frame in `line` (without CR); None if the line is not exactly one frame."""
     letter = line[0]
     extended = letter in b"TR"
     try:
-        # One conversion for all digits: it is strict (no signs, spaces or underscores).
+        # All digits are converted at once. The conversion is strict: no signs, spaces or
+        # underscores.
         raw = unhexlify(b"0" + line[1:] if extended else line[1:])
     except ValueError:
         return None
@@ -103,16 +109,16 @@ def _frame(line: bytes, t_ns: int) -> CanFrame | None:
 
 
 class SlcanCodec:
-    """Decoder of pieces of any size to frames and lines; never raises.
+    """Codec that converts byte strings of any size to frames and lines; it never raises.
 
     Parameters
     ----------
     baud : int, optional
-        Speed of the serial line, bit/s: one character lasts 10/baud seconds. None for USB.
+        Speed of the serial line, bit/s. One character lasts 10/baud seconds. None for USB.
     role : Role
-        ``host`` (reads an adapter) or ``adapter`` (reads a host).
+        ``host`` to read from an adapter, ``adapter`` to read from a host.
     bitrate : int
-        Bit rate of the bus, bit/s.
+        Bit rate of the CAN bus, bit/s.
     """
 
     def __init__(
@@ -128,12 +134,12 @@ class SlcanCodec:
         self.discarded_bytes = 0
 
     def feed(self, data: bytes, t_ns: int) -> list[CanFrame | SlcanLine | CorruptBytes]:
-        """Return the content that `data` completed, in wire order.
+        """Return the frames and lines that `data` completes, in wire order.
 
-        The ``t_ns`` of a frame is the start of its line: the arrival `t_ns` minus the duration of
-        all characters from the start of the line on. On USB, the duration of the frames on the bus
-        is subtracted instead. A line that lies completely in `data` is never stamped before the
-        previous call.
+        The ``t_ns`` of a frame is the start of its line. It is the arrival `t_ns` minus the
+        duration of all characters from the start of the line on. On USB, the duration of the frames
+        on the bus is subtracted instead. The stamp of a line that lies completely in `data` is
+        never earlier than the previous call.
         """
         found: list[CanFrame | SlcanLine | CorruptBytes] = []
         *lines, rest = (self._pending + data).replace(b"\n", b"").split(b"\r")
@@ -148,7 +154,7 @@ class SlcanCodec:
             after_ns -= (len(line) + 1) * self._character_ns or self._on_bus_ns(line)
             before -= len(line) + 1
 
-        # An overlong line is cut to its end, in which a frame may have begun.
+        # An overlong line is truncated to its end, in which a frame may have begun.
         rest = self._split_bells(rest, found)
         if len(rest) > _LONGEST:
             self._endless = True
@@ -158,12 +164,12 @@ class SlcanCodec:
         return found
 
     def flush(self) -> list[CorruptBytes]:
-        """Discard an unfinished line."""
+        """Discard an incomplete line."""
         rest, self._pending, self._endless = self._pending, b"", False
         return [self._corrupt(len(rest), "unfinished line")] if rest else []
 
     def _on_bus_ns(self, line: bytes) -> float:
-        """Return the duration of the line's frame on the bus, ns; 0 for other lines."""
+        """Return the duration of a line's frame on the bus, ns; 0 for lines without a frame."""
         if not line or line[0] not in b"tTrR":
             return 0.0
         extended = line[0] in b"TR"
@@ -184,7 +190,7 @@ class SlcanCodec:
     def _decode_line(
         self, line: bytes, t_ns: int, found: list[CanFrame | SlcanLine | CorruptBytes]
     ) -> None:
-        """Append the content of `line` (without CR)."""
+        """Append the frame, answer or command in `line` (without CR)."""
         if line and line[0] in b"tTrR":
             frame = _frame(line, t_ns)
             if frame is not None:
@@ -205,7 +211,10 @@ class SlcanCodec:
     def _recover_frame(
         self, line: bytes, t_ns: int, found: list[CanFrame | SlcanLine | CorruptBytes]
     ) -> None:
-        """Append the frame at the end of a broken `line`, if there is one; noise may precede it."""
+        """Append the frame at the end of a corrupt `line`, if there is one.
+
+        Noise may precede it.
+        """
         for at in range(max(0, len(line) - _WINDOW), len(line)):
             if line[at] in b"tTrR":
                 frame = _frame(line[at:], t_ns + round(at * self._character_ns))

@@ -1,4 +1,4 @@
-"""LP-Research LPMS: LP-BUS on a serial line, in two generations, and channels on CAN."""
+"""Wire formats of LP-Research LPMS: LP-BUS on a serial line (two generations), channels on CAN."""
 
 from jointfit_protocols.lpms._framing import (
     MAX_DATA,

@@ -3,13 +3,14 @@
      0     1-2   3-4       5-6   7 .. 6+n   7+n, 8+n   9+n   10+n
     | 3A | id  | command | n   | data ... | LRC      | 0D  | 0A  |      n <= 1024
 
-Numbers are little-endian. LRC is the 16-bit sum of identifier, command, n and data. Two readings of
-the vendor's documents exist: the sum of the bytes, and the sum of 16-bit words in the head. They
-agree while all three numbers are below 256. Both are accepted, the sum of the bytes is sent.
+Numbers are little-endian. LRC is the 16-bit sum of identifier, command, n and data. The vendor's
+documents permit two interpretations: the sum of the bytes, or the sum of 16-bit words in the head.
+Both are equal while identifier, command and n are below 256. The codec accepts both, and sends the
+sum of the bytes.
 
 Source: protocol pages of the vendor's knowledge base; OpenZen (MIT) for the two sums.
 
-Invariant: bytes in, messages out; no port, no clock.
+Invariant: the codec converts bytes to messages. It uses no port and no clock.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from jointfit_protocols.corrupt import CHECKSUM, NO_START, CorruptBytes
 from jointfit_protocols.resynchronizing_codec import ResynchronizingCodec
 
 MAX_DATA = 1024
-"""Maximum number of bytes of data. It bounds the wait after a corrupt length."""
+"""Largest number of data bytes. The limit bounds the wait after a corrupt length."""
 OVERHEAD = 11
 """Length of a message without its data, bytes."""
 MAX_MESSAGE = MAX_DATA + OVERHEAD
@@ -31,29 +32,29 @@ _END = b"\r\n"
 _HEAD = 7
 _TAIL = 4
 _CARRY = 0xFF
-"""Difference of the two sums for each unit of a high byte in the head."""
+"""Difference between the two sums for each unit of a high byte in the head."""
 _HEADER = struct.Struct("<BHHH")
 _LRC = struct.Struct("<H")
 
 
 class LpBusMessage(NamedTuple):
-    """One message with a valid sum."""
+    """One message whose sum is correct."""
 
     sensor_id: int
     command: int
     data: bytes
     end: int = 0
-    """Number of bytes fed to the decoder up to and including the message, for back-dating of the
+    """Number of bytes fed to the codec until the end of the message, for back-dating of the
     message."""
 
     @property
     def size(self) -> int:
-        """Length on the wire, bytes."""
+        """Length of the message on the wire, bytes."""
         return len(self.data) + OVERHEAD
 
 
 def encode(command: int, data: bytes = b"", sensor_id: int = 1) -> bytes:
-    """Return the message on the wire, with the sum of the bytes.
+    """Return the bytes of a message on the wire; the checksum is the sum of the bytes.
 
     Raises
     ------
@@ -80,7 +81,7 @@ _LENGTH = CorruptBytes(1, "length above 1024")
 
 
 def _read_message(buffer: bytes, at: int, base: int) -> LpBusMessage | CorruptBytes | None:  # noqa: PLR0911 - one for each fault
-    """Return the message that begins at `at`, the reason why none does, or None if it is cut."""
+    """Return the message at `at`, the reason why there is none, or None if it is incomplete."""
     if buffer[at] != _START:
         return _NO_START
 
@@ -101,7 +102,7 @@ def _read_message(buffer: bytes, at: int, base: int) -> LpBusMessage | CorruptBy
     by_bytes = sum(buffer[at + 1 : tail])
     lrc = buffer[tail] | buffer[tail + 1] << 8
     if (by_bytes - lrc) & 0xFFFF:
-        # a vendor program sums identifier, command and length as words of 16 bits
+        # One of the vendor's programs sums identifier, command and length as words of 16 bits.
         by_words = by_bytes + _CARRY * (buffer[at + 2] + buffer[at + 4] + buffer[at + 6])
         if (by_words - lrc) & 0xFFFF:
             return _CHECKSUM
@@ -109,9 +110,9 @@ def _read_message(buffer: bytes, at: int, base: int) -> LpBusMessage | CorruptBy
 
 
 class LpBusCodec(ResynchronizingCodec[LpBusMessage]):
-    """Decoder of pieces of any size to messages; the result does not depend on the pieces.
+    """Codec that converts byte strings of any size to messages; their boundaries do not matter.
 
-    Runs of corrupt bytes are reported at the latest every 1035 bytes.
+    Runs of corrupt bytes are reported after at most 1035 bytes.
     """
 
     def __init__(self) -> None:

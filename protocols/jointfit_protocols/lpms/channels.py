@@ -1,21 +1,21 @@
-"""LPMS sensors on CAN: channels in up to four frames a period, and the heartbeat.
+"""LPMS sensors on CAN: channels in up to four frames per period, and heartbeats.
 
     16 bit   | channel 4 k + 1 | 4 k + 2 | 4 k + 3 | 4 k + 4 |    4 x int16, k = 0 to 3
     32 bit   | channel 2 k + 1 | 2 k + 2 |                        2 x float32, k = 0 to 3
 
-Numbers are little-endian. The user chooses the quantity of each channel over the sensor's UART, so
-the channels of w, x, y and z are settings. No time and no sequence number can be sent.
+Numbers are little-endian. The user selects the quantity of each channel over the sensor's UART, so
+the channels of w, x, y and z are settings. The sensor cannot send a time or a sequence number.
 
 A quaternion in two frames is complete only if the frames follow each other in order and within half
-a period; halves of different instants would give a wrong orientation.
+a period. Halves from different instants would yield a wrong orientation.
 
-The two modes differ in identifiers alone. CANopen style uses 0x180, 0x280, 0x380 and 0x480 plus the
-node number, and a heartbeat at 0x700 plus the node number. Sequential identifiers follow a start
-identifier by one of two rules (`sequential_ids`).
+The two modes differ only in the identifiers. CANopen style uses 0x180, 0x280, 0x380 and 0x480 plus
+the node number, and a heartbeat at 0x700 plus the node number. In sequential mode, the identifiers
+follow a start identifier by one of two rules (`sequential_ids`).
 
 Source: the vendor's page on CAN parsing for LPMS3; firmware source of 2013.
 
-Invariant: frames in, quaternions out; no bus, no clock.
+Invariant: the codec converts frames to quaternions. It uses no bus and no clock.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ if TYPE_CHECKING:
 Precision = Literal["int16", "float32"]
 
 FRAMES = 4
-"""Frames of a sensor in each period."""
+"""Number of frames that a sensor sends in each period."""
 FRAME_BYTES = 8
 HEARTBEAT = 0x700
-"""Identifier of the heartbeat of node 0."""
+"""Identifier of the heartbeat of the node 0."""
 TPDO = (0x180, 0x280, 0x380, 0x480)
-"""Identifiers of node 0 in CANopen style."""
+"""Identifiers of the frames of the node 0 in CANopen style."""
 OPERATIONAL = 5
-"""State in the heartbeat of a sensor that sends."""
+"""State in the heartbeat of a sensor that sends data."""
 BOOTED = 0
-"""State in the first heartbeat after a start, by CANopen."""
+"""State in the first heartbeat after a start, as defined by CANopen."""
 START_ID = 0x514
-"""Usual start identifier of sequential mode."""
+"""Default start identifier of sequential mode."""
 _STRUCTS = {"int16": struct.Struct("<4h"), "float32": struct.Struct("<2f")}
 PER_FRAME: dict[Precision, int] = {"int16": 4, "float32": 2}
-"""Channels in each frame."""
+"""Number of channels in each frame."""
 
 
 def tpdo_ids(node: int) -> tuple[int, int, int, int]:
@@ -60,53 +60,53 @@ def sequential_ids(
 ) -> tuple[int, int, int, int]:
     """Return the identifiers of a node in sequential mode.
 
-    The vendor's sources disagree: ``start_id + node + k`` by the page on LPMS3, where the
-    identifiers of neighbouring nodes overlap, and ``start_id + 8 (node - 1) + k`` (`spaced`) by the
-    firmware of 2013 and another page.
+    The vendor's sources disagree. According to the page on LPMS3, the identifiers are ``start_id +
+    node + k``, so those of adjacent nodes overlap. According to the firmware of 2013 and another
+    page, they are ``start_id + 8 (node - 1) + k`` (`spaced`).
     """
     base = start_id + (8 * (node - 1) if spaced else node)
     return base, base + 1, base + 2, base + 3
 
 
 class ChannelIds(NamedTuple):
-    """Identifiers of one sensor, all of 11 bits."""
+    """Identifiers of one sensor, each with 11 bits."""
 
     frames: tuple[int, int, int, int]
     heartbeat: int | None = None
 
 
 class ChannelQuaternion(NamedTuple):
-    """One quaternion with the values as sent."""
+    """One quaternion with its values as sent."""
 
     t_ns: int
-    """Stamp of its first frame."""
+    """Stamp of the quaternion's first frame, ns."""
     values: tuple[float, float, float, float]
-    """w x y z; integers with 16 bits."""
+    """Components w, x, y and z. With 16 bits they are integers."""
 
 
 class Heartbeat(NamedTuple):
-    """State of a sensor."""
+    """State that a sensor reports about itself."""
 
     t_ns: int
     state: int
 
 
 def decode_frame(data: bytes, precision: Precision) -> tuple[float, ...] | None:
-    """Return the channels in the data field of a frame; None if it has not 8 bytes."""
+    """Return the channels in the data of a frame; None if the data do not have 8 bytes."""
     return _STRUCTS[precision].unpack(data) if len(data) == FRAME_BYTES else None
 
 
 def encode_frames(
     ids: Sequence[int], channels: Sequence[float], precision: Precision, t_ns: int = 0
 ) -> list[CanFrame]:
-    """Return the frames of one period; integers are rounded and limited to 16 bits.
+    """Return the frames of one period. Integers are rounded and limited to 16 bits.
 
     Parameters
     ----------
     ids
         Identifiers of the four frames.
     channels
-        Values of all channels: 16 with 16 bits, 8 with 32 bits.
+        Values of all channels: 16 channels with 16 bits, or 8 channels with 32 bits.
     precision
         Format of the channels.
     t_ns
@@ -129,14 +129,14 @@ def encode_heartbeat(number: int, state: int = OPERATIONAL, t_ns: int = 0) -> Ca
 
 
 def frames_of(channels: Iterable[int], precision: Precision) -> tuple[int, ...]:
-    """Return the indices of the frames that carry `channels` (from 1), ascending."""
+    """Return the indices of the frames that contain `channels` (counted from 1), ascending."""
     return tuple(sorted({(channel - 1) // PER_FRAME[precision] for channel in channels}))
 
 
 class LpmsCanCodec:
-    """Decoder of one sensor's frames to quaternions; never raises.
+    """Codec that converts one sensor's frames to quaternions; it never raises.
 
-    Frames with other identifiers are ignored and counted.
+    Frames with other identifiers are counted and ignored.
 
     Parameters
     ----------
@@ -145,9 +145,9 @@ class LpmsCanCodec:
     precision : Precision
         Format of the channels.
     mapping : tuple of int
-        Channels of w, x, y and z, from 1.
+        Channels of w, x, y and z, counted from 1.
     longest_ns : int
-        Largest time, ns, between the frames of one quaternion: half a period.
+        Longest time between the frames of one quaternion, ns, equal to half a period.
     """
 
     def __init__(
@@ -171,16 +171,17 @@ class LpmsCanCodec:
         self._received = 0  # frames of the open quaternion
         self._t_ns = 0
         self.messages = 0
-        """Well-formed frames of this sensor."""
+        """Number of well-formed frames of this sensor."""
         self.incomplete = 0
-        """Frames of quaternions whose other frames did not arrive in order and in time."""
+        """Number of frames of quaternions whose other frames did not arrive in order and in
+        time."""
         self.idle = 0
-        """Frames of this sensor without a component of the quaternion."""
+        """Number of frames of this sensor that contain no component of the quaternion."""
         self.foreign = 0
-        """Frames of other devices."""
+        """Number of frames of other devices."""
 
     def feed(self, frame: CanFrame) -> ChannelQuaternion | Heartbeat | CorruptBytes | None:
-        """Return the content that `frame` completed, or None."""
+        """Return the content that `frame` completes; None if there is none."""
         t_ns, can_id, data, extended, error, remote = frame
         place = self._order.get(can_id)
         if extended or error or remote or (place is None and not self._is_mine(can_id)):
@@ -199,7 +200,8 @@ class LpmsCanCodec:
             self.incomplete += self._received
             self._t_ns, self._values, self._received = t_ns, values, 1
         elif place == self._received and abs(t_ns - self._t_ns) <= self._longest_ns:
-            # frames come in order, while their stamps may differ by the error of two clock readings
+            # Frames arrive in order, but their stamps may differ by the error of two clock
+            # readings.
             self._values += values
             self._received += 1
         else:
@@ -222,7 +224,7 @@ class LpmsCanCodec:
         return can_id in self._idle or can_id == self._heartbeat
 
     def _other_frame(self, t_ns: int, can_id: int, data: bytes) -> Heartbeat | CorruptBytes | None:
-        """Return the content of a frame without a component of the quaternion."""
+        """Return the content of a frame that contains no component of the quaternion."""
         if can_id == self._heartbeat:
             if not data:
                 return CorruptBytes(0, "heartbeat without state")

@@ -1,7 +1,7 @@
-"""Commands and settings of LPMS sensors, by generation.
+"""Commands and settings of LPMS sensors, for both generations.
 
-Both generations use the same messages, and the same numbers for different commands. A read of one
-generation is a write of the other:
+Both generations use the same message format, but some numbers mean different commands. A command
+that reads a setting in one generation may write a setting in the other:
 
 | purpose               | generation 1                       | generation 3                     |
 |-----------------------|------------------------------------|----------------------------------|
@@ -16,10 +16,11 @@ generation is a write of the other:
 | firmware              | 2F: patch, minor, major            | 15: text                         |
 | 5B                    | device name, text                  | filter mode, U4                  |
 
-Settings are lost with power unless stored: the firmware of 2013 writes its registers in memory.
+The settings are lost at power-off unless they are stored, because the firmware of 2013 writes its
+registers in memory.
 
-Source: the vendor's register headers (OpenMAT), protocol pages and firmware source of 2013. Nobody
-has tested 5B on hardware; both headers list it as a read.
+Source: the vendor's register headers (OpenMAT), protocol pages and firmware source of 2013. The
+command 5B was not tested on hardware; both headers list it as a read command.
 """
 
 from __future__ import annotations
@@ -34,11 +35,11 @@ Generation = Literal[1, 3]
 _WORD = struct.Struct("<I")
 _VERSION = struct.Struct("<3I")
 _SIXTEEN_BIT = 1 << 22
-"""Bit of the configuration word of generation 1: data are int16."""
+"""Bit of the configuration word in generation 1: the data are int16."""
 _RATE_CODE = 0x7
-"""Bits of the configuration word of generation 1 with the code of the rate."""
+"""Bits of the configuration word in generation 1 that contain the code of the rate."""
 SECONDS_UP_TO = (1, 3, 4)
-"""Last firmware of generation 1 whose device time is float32 seconds."""
+"""Newest firmware of generation 1 whose device time is float32 seconds."""
 
 
 class LpmsCommand(IntEnum):
@@ -50,29 +51,30 @@ class LpmsCommand(IntEnum):
     STREAM_MODE = 0x07
     DATA = 0x09
     IDENTIFY = 0x5B
-    """Read command: returns the device name in generation 1, the filter mode in generation 3."""
+    """Read command that returns the device name in generation 1 and the filter mode in generation
+    3."""
 
 
 class LpmsOutput(NamedTuple):
-    """One quantity of a data packet."""
+    """One quantity that a data packet may contain."""
 
     name: str
     bit: int
-    """Bit of the mask that enables it."""
+    """Bit of the output mask that enables the quantity."""
     values: int = 3
 
 
 @dataclass(frozen=True, slots=True)
 class CommandTable:
-    """Commands and outputs of one generation."""
+    """Commands and outputs of one sensor generation."""
 
     generation: Generation
     models: str
     outputs: tuple[LpmsOutput, ...]
-    """Outputs in the order of a data packet."""
+    """Outputs in the order in which a data packet contains them."""
     rates_hz: tuple[int, ...]
     tick_hz: int
-    """Usual unit of the device time, 1/s."""
+    """Default unit of the device time, ticks per second."""
     set_outputs: int
     set_rate: int
     set_precision: int
@@ -80,15 +82,15 @@ class CommandTable:
     factory_reset: int
     read_firmware: int
     reads: tuple[int, ...]
-    """Commands that read outputs, rate and precision."""
+    """Commands that read the settings of outputs, rate and precision."""
 
     @property
     def quaternion(self) -> int:
-        """Mask of the quaternion alone."""
+        """Output mask for the quaternion alone."""
         return self.mask("quaternion")
 
     def mask(self, *names: str) -> int:
-        """Return the mask of the named outputs."""
+        """Return the output mask of the named outputs."""
         return sum(1 << output.bit for output in self.outputs if output.name in names)
 
     def names(self, mask: int) -> list[str]:
@@ -158,16 +160,16 @@ TABLES: dict[int, CommandTable] = {1: GENERATION_1, 3: GENERATION_3}
 
 
 class LpmsConfiguration(NamedTuple):
-    """Settings that determine the data packets; None: not known."""
+    """Settings that determine the data packets; None for unknown settings."""
 
     outputs: int | None = None
-    """Mask of the outputs."""
+    """Mask of the enabled outputs."""
     rate_hz: int | None = None
     floats: bool | None = None
     """Whether values are float32; otherwise they are int16."""
 
     def updated(self, part: LpmsConfiguration) -> LpmsConfiguration:
-        """Return these settings with the known ones of `part`."""
+        """Return these settings, updated with the known settings of `part`."""
         known = {key: value for key, value in part._asdict().items() if value is not None}
         return self._replace(**known)
 
@@ -175,7 +177,7 @@ class LpmsConfiguration(NamedTuple):
 def decode_configuration(
     table: CommandTable, command: int, data: bytes
 ) -> LpmsConfiguration | None:
-    """Return the settings in the reply to one of `table.reads`; None if it is no such reply."""
+    """Return the settings in a reply to one of `table.reads`; None for any other reply."""
     if command not in table.reads or len(data) != _WORD.size:
         return None
     (word,) = _WORD.unpack(data)
@@ -202,7 +204,7 @@ def encode_configuration(
     Raises
     ------
     ValueError
-        A setting is None, or not one of the generation.
+        A setting is None, or the generation does not have it.
     """
     mask, rate_hz, floats = configuration
     if mask is None or rate_hz is None or floats is None:
@@ -214,21 +216,21 @@ def encode_configuration(
 
 
 def set_command(table: CommandTable, part: LpmsConfiguration) -> list[tuple[int, bytes]]:
-    """Return the commands, with their data, that set the known settings of `part`."""
+    """Return the commands with their data that set all known settings of `part`."""
     commands = []
     if part.outputs is not None:
         commands.append((table.set_outputs, _WORD.pack(part.outputs)))
     if part.rate_hz is not None:
         commands.append((table.set_rate, _WORD.pack(part.rate_hz)))
     if part.floats is not None:
-        # the two generations count in opposite senses
+        # The flag for 16 or 32 bits has opposite meanings in the two generations.
         value = part.floats if table.generation == 3 else not part.floats  # noqa: PLR2004 - a generation, or ASCII
         commands.append((table.set_precision, _WORD.pack(int(value))))
     return commands
 
 
 def decode_set(table: CommandTable, command: int, data: bytes) -> LpmsConfiguration | None:
-    """Return the setting that a command makes; None if it is no such command."""
+    """Return the setting that a command sets; None if the command sets none."""
     if len(data) != _WORD.size:
         return None
     (word,) = _WORD.unpack(data)
@@ -274,5 +276,5 @@ def identify_generation(data: bytes) -> Generation | None:
 
 
 def decode_text(data: bytes) -> str:
-    """Return a text: ASCII, padded with spaces or zeros."""
+    """Return an ASCII text without the spaces or zeros at its end."""
     return data.decode("ascii", "replace").strip(" \0\r\n")

@@ -1,9 +1,10 @@
-"""Data packets of LPMS sensors: device time, then the enabled outputs in a fixed order.
+"""Data packets of LPMS sensors: device time, followed by the enabled outputs in a fixed order.
 
     | tick U4 | value ... |      each value float32, or int16
 
-The packet does not name its outputs. Their mask, which is read from the device, determines the
-order, and the length of the packet shows whether the values have 32 or 16 bits.
+The packet does not state which outputs it contains. The output mask, which is read from the device,
+determines the order of the values. The length of the packet shows whether the values have 32 or 16
+bits.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from jointfit_protocols.lpms.configuration import CommandTable
 
 TICK_MODULUS = 1 << 32
-"""Ticks after which device time wraps."""
+"""Number of ticks after which device time wraps."""
 _TICK = struct.Struct("<I")
 _SECONDS = struct.Struct("<f")
 
