@@ -27,7 +27,7 @@ class StaticQuality:
 
 @dataclass(frozen=True, slots=True)
 class SensorRotations:
-    """The rotations by which fusion converts the orientation of one sensor to its segment."""
+    """Rotations by which the fusion converts the orientation of one sensor to its segment."""
 
     q_sensor_segment: Quaternion
     """Sensor-to-segment alignment."""
@@ -239,12 +239,12 @@ class HoldoutQuality:
 
 @dataclass(frozen=True, slots=True)
 class RegressionQuality:
-    """Regression coefficients of one segment: rows w, x, y, z; columns `sensors`, intercept."""
+    """Regression coefficients of one segment, with rows w, x, y, z and a column per sensor."""
 
     sensors: tuple[str, ...]
     q_sign: Quaternion
-    """Reference quaternion: quaternions whose dot product with it is negative change their sign
-    before the regression.
+    """Reference quaternion. Before the regression, quaternions with a negative dot product with it
+    change their sign.
     """
     verified: tuple[tuple[float, ...], ...]
     """Coefficients that were fitted to the first part of the trial. ``holdout`` contains their

@@ -42,7 +42,7 @@ class SensorTrack:
 
 @dataclass(frozen=True, slots=True)
 class OpticalTrack:
-    """Measurements of the optical system over time; NaN where occluded."""
+    """Measurements of the optical system over time, with NaN for occluded markers and bodies."""
 
     t_ns: NDArray[np.int64]
     """Instants of exposure, shape (m,), strictly increasing."""

@@ -79,10 +79,10 @@ def joint_trajectory(sides: Sequence[JointSide], frames: int) -> JointTrajectory
     If the two sides differ by more than their errors predict, E is multiplied by the ratio of
     observed to predicted difference.
 
-    Along a direction observed by only one side, the position comes from this side. Along a
-    direction observed by neither side, the position comes from the first side. The second side is
-    then shifted to agree with the first side on average. For a planar method this direction is the
-    normal, and the position along the normal is the mean of the segment's markers.
+    Along a direction that only one side observed, the position is computed from this side. Along a
+    direction that neither side observed, the position is computed from the first side. The second
+    side is then shifted to agree with the first side on average. For a planar method this direction
+    is the normal, and the position along the normal is the mean of the segment's markers.
 
     Parameters
     ----------

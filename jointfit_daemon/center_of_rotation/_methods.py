@@ -123,8 +123,7 @@ def _beyond_parent(found: CenterEstimate, parent: Array | None) -> CenterEstimat
     if parent is None or found.refused is not None or len(found.center) < 3:
         return found
     turn = sqrt(NOISE_FACTOR) * turn_noise(parent, found.noise)
-    # directions spread evenly over an arc have a mean distance of a quarter of the arc to the
-    # middle
+    # for directions spread evenly over an arc, the mean angle to the middle is arc / 4
     if found.arc / 4.0 > turn:
         return found
     why = (

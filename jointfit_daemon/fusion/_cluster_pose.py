@@ -47,7 +47,7 @@ class FittedPose(NamedTuple):
     """Rigid motion of a cluster from the static pose to one frame."""
 
     q: Quaternion
-    """q_optical_static: from the static world to the optical world."""
+    """Rotation q_optical_static from the static world to the optical world."""
     points: list[Vector]
     """Positions of the fixed points, optical world, m."""
 

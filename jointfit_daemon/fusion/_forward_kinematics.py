@@ -1,8 +1,8 @@
 """Forward kinematics of one frame: joint positions and angles with standard deviations.
 
-Orientation errors are taken as isotropic and independent between segments, except for flexion (see
-`joint_angle_estimate`). Only the trace of a position covariance is propagated, because a LimbState
-contains nothing else of the covariance.
+Orientation errors are assumed to be isotropic and independent between segments.
+`joint_angle_estimate` describes an exception for flexion. Only the trace of a position covariance
+is propagated, because a LimbState contains nothing else of the covariance.
 """
 
 from __future__ import annotations

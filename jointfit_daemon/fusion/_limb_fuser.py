@@ -63,7 +63,7 @@ class LimbFuser:
         Existing monitor to use, so that a change of the calibration does not reset the sensor
         states.
     drifting : collection of str
-        Sensors without heading reference, see ``ConsistencyMonitor``.
+        Sensors without heading reference, for ``ConsistencyMonitor``.
     """
 
     def __init__(
@@ -139,8 +139,8 @@ class LimbFuser:
         Parameters
         ----------
         t_ns, completed_ns, seq
-            Instant of the frame, arrival of its last sample, and frame number. The state contains
-            them unchanged.
+            Instant of the frame, arrival of its last sample, and frame number, which are copied to
+            the state.
         orientations : mapping of str to Quaternion
             q_world_sensor of every sensor with data, each in its own world. Unknown sensors are
             ignored. Must not be changed afterwards.
@@ -149,8 +149,7 @@ class LimbFuser:
         optical_origin : Vector, optional
             Position of O1 in the current mocap frame, m; overrides the configured origin.
         sync, mode
-            Values that the state contains unchanged; without a calibration the mode is
-            ``uncalibrated``.
+            Values that are copied to the state; without a calibration the mode is ``uncalibrated``.
 
         Notes
         -----
@@ -207,7 +206,7 @@ class LimbFuser:
         return LimbState(seq, t_ns, completed_ns, mode, sync, tuple(flags), segments, joints)
 
     def replace_models(self, calibration: Calibration) -> None:
-        """Use the models of a calibration that is otherwise equal; the output fades to them."""
+        """Use the models of an otherwise equal calibration, with a fade of the output."""
         if self._calibration is None:
             return
         self._calibration = calibration

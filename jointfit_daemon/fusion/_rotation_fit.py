@@ -62,7 +62,7 @@ def fit_rotation(s: tuple[Vector, Vector, Vector], bound: float) -> tuple[Quater
     (a, b, c), (d, e, f), (g, h, i) = s
     largest, slope = _largest_root(s, bound)
 
-    # The adjugate of N - λ I is -p'(λ) q q^T: each column is q times one component of q.
+    # The adjugate of N - λ I is -p'(λ) q q^T, so each column is q times one component of q.
     ww, xx, yy, zz = (
         a + e + i - largest,
         a - e - i - largest,

@@ -1,8 +1,8 @@
 """Orientation of one segment from the sensors that have data.
 
-The orientation is the first available of these: the prediction of the model trained for exactly
-these sensors, the mean of these sensors, the last orientation for 0.2 s, and None. If the set of
-sensors changes, the output moves from the old to the new orientation within 0.25 s:
+If a model was trained for exactly these sensors, the orientation is its prediction. Otherwise it is
+the mean of these sensors. Without sensors it is the last orientation for 0.2 s, then None. If the
+set of sensors changes, the output moves from the old to the new orientation within 0.25 s:
 
 - If a sensor returns, both sets have data, and their predictions are blended. The first sample of a
   returning sensor is often wrong, but its frame has a small weight.
@@ -40,7 +40,7 @@ MIN_SD = 0.0005
 HEADING_SD = radians(2.0)
 """Standard deviation of the heading of a sensor's world just after calibration, rad. The value was
 measured on simulated subjects one minute after calibration. The error is common to the sensors of a
-segment, so the training data do not show it. It hardly affects flexion.
+segment, so the training data do not show it. The error hardly affects flexion.
 """
 HEADING_WALK = radians(0.3)
 """Random walk of the heading of a sensor's world, rad per square root of a minute. After an hour
@@ -127,7 +127,7 @@ class SegmentFuser:
         """Inputs and output of the last frames."""
 
     def replace_models(self, models: Mapping[str, SegmentModel]) -> None:
-        """Use other models of the same sensors; the output fades to them."""
+        """Use other models of the same sensors, with a fade of the output."""
         if self._replaced_models is None:
             self._replaced_models = self._models
         self._use(models)
@@ -221,7 +221,7 @@ class SegmentFuser:
         return model.predict_one(sensors, mean_one([inputs[s] for s in others]))
 
     def _start_model_fade(self, t_ns: int, alive: Names, near: Names, inputs: Inputs) -> None:
-        """Start a fade from predictions of the old models to those of the new models."""
+        """Start a fade from the predictions of the old models to the new predictions."""
         new, old = self._models, self._replaced_models
         self._replaced_models = None
         if old is None or self._last is None or t_ns - self._last[0] > HOLD_NS:

@@ -2,7 +2,7 @@
 
 Invariants: ``Calibration.from_dict(c.to_dict()) == c`` to the last bit, even after a conversion to
 JSON text. The record never contains NaN or infinity. Time of creation and software version are
-arguments; this module does not read them.
+arguments of the caller.
 """
 
 from __future__ import annotations

@@ -10,7 +10,8 @@ segment and has smaller errors on the trained movements. Inside the training ran
 equal weight. Outside, their weights :math:`\eta` decrease, and the linear trend T of
 `_kernel_trend`, which extrapolates best, replaces them. The weight of b decreases from the limit of
 the training range on, the weight of a from a larger distance on. The trend has no component about
-the long axis. About this axis, a replaces b, and zero replaces a.
+the long axis. About this axis the correction of a replaces the correction of b, and zero replaces
+the correction of a.
 
 Invariants: the correction is zero if the segment is upright, the joint is straight and the sensors
 agree. A rotation of the world about the vertical does not change the correction.
@@ -71,9 +72,9 @@ class KernelModel(SegmentModel):
 
     sensors: int
     plain: KernelExpert
-    """Expert a: regression on relative rotations."""
+    """Expert a, a regression on relative rotations."""
     tilted: KernelExpert
-    """Expert b: regression on relative rotations and tilt."""
+    """Expert b, a regression on relative rotations and tilt."""
     trend: tuple[tuple[float, ...], tuple[float, ...]]
     """Coefficients of the trend T about x and y, for [1, relative rotations, tilts]."""
     spread: LeverageVariance
@@ -131,7 +132,8 @@ class KernelModel(SegmentModel):
         (ax, ay, az), (bx, by, bz) = a, b
         rest, along = 1.0 - p - s, p / (1.0 - SHARE)
 
-        # There is no trend about z: a replaces b, and zero replaces a.
+        # Without a trend about z, the correction of a replaces that of b, and zero replaces that of
+        # a.
         c = (
             p * ax + s * bx + rest * tx,
             p * ay + s * by + rest * ty,

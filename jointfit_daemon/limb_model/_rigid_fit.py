@@ -31,7 +31,7 @@ MIN_WIDTH_SHARE = 0.08
 """
 
 MAX_BRIDGE = 60
-"""Longest run of frames with a missing marker that is interpolated, frames."""
+"""Largest number of successive frames with a missing marker that are interpolated."""
 
 MAX_FIT_RMS_M = 0.03
 """RMS residual above which markers must be swapped or mislabeled, m, because soft tissue moves

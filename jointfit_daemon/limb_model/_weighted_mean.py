@@ -41,7 +41,7 @@ def fuse(sensors: Sequence[Array], weights: Sequence[float]) -> Array:
         mean[finite] = rotation.average(stacked, np.broadcast_to(weights, stacked.shape[:2]))
         return mean
 
-    # Two sensors have the closed form of `fuse_one`, here for all frames.
+    # For two sensors the closed form of `fuse_one` is evaluated for all frames.
     first, second = sensors
     w1, w2 = weights
     d = np.sum(first * second, axis=1)

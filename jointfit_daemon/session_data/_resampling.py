@@ -131,7 +131,7 @@ def interpolate_orientations(t_s: Array, q: Array, at_s: Array) -> Array:
 
 
 def _neighbours(t_s: Array, at_s: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
-    """Return the rows before and after each instant, and its position between them; NaN in gaps."""
+    """Return the rows before and after each instant, and the position in between; NaN in gaps."""
     if not len(t_s):
         none = np.zeros(len(at_s), dtype=np.intp)
         return none, none, np.full(len(at_s), np.nan)

@@ -1,1 +1,1 @@
-"""Time: device clocks, lag between systems, alignment of streams to frames."""
+"""Timing: device clocks, lag between systems, and alignment of streams to frames."""

@@ -121,7 +121,7 @@ def artefact_leverage(points: Array, center: Array, unseen: Array) -> Array:
     points : ndarray, shape (n, k, 3)
         Markers of the distal part in coordinates of the proximal part, m; NaN if not visible.
     center : ndarray, shape (3,)
-        m.
+        Center, m.
     unseen : ndarray, shape (u, 3)
         Unit vectors of the unobserved directions.
     """
@@ -163,8 +163,8 @@ def joint_center(parent: ClusterTrack, child: ClusterTrack, start: Array) -> Cen
     The markers of the distal part are first transformed to static-world coordinates of the proximal
     part, in which the center is fixed. A sphere fit to these markers determines which directions
     were observed. Along these directions the center is the point that coincides in both parts. The
-    sphere fit would be biased: noise in the markers of the proximal part rotates its pose, which
-    moves distant markers off their spheres.
+    sphere fit is not used for these directions, because noise in the proximal markers rotates the
+    pose of this part. The rotation moves distant markers off their spheres and biases the center.
     """
     found = fit_center(parent.to_static(child.points), start)
     if found.refused is not None:
@@ -189,7 +189,7 @@ def joint_center(parent: ClusterTrack, child: ClusterTrack, start: Array) -> Cen
 
 
 def _markers(track: ClusterTrack) -> Array:
-    """Return the markers of a part in the static world, m, medians over the frames, (k, 3)."""
+    """Return the median position over the frames of each marker in the static world, m, (k, 3)."""
     local = track.to_static(track.points)
     local = local[:, visible(local).any(axis=0)]
     return np.asarray(np.nanmedian(local, axis=0))

@@ -315,7 +315,7 @@ def on_skin(fit: CenterEstimate) -> Array:
 
 
 def artefact_covariance(fit: CenterEstimate) -> Array:
-    r"""Return :math:`C + \sigma_r^2 L`, 0 along unobserved directions, m², shape (3, 3)."""
+    r"""Return :math:`C + \sigma_r^2 L`, which is 0 along unobserved directions, m², (3, 3)."""
     if fit.leverage is None:
         return fit.covariance
     return fit.covariance + RADIAL_ARTEFACT_SD_M**2 * fit.leverage
@@ -448,7 +448,7 @@ def _axis_joints(chain: Chain, i: int, axes: Mapping[str, FlexionAxis]) -> list[
 
 
 def _mean_axis(axes: Sequence[FlexionAxis]) -> Array | None:
-    """Return the mean of axes, weighted by the rotation about each; None without an axis."""
+    """Return the mean of axes, weighted by their rotations; None without an axis."""
     if not axes:
         return None
     mean = np.sum([axis.axis * axis.rms for axis in axes], axis=0)

@@ -38,7 +38,7 @@ def apply_standing_prior(
 
     .. math:: 0 = S (c_i - c_{i+1}) + e, \qquad e \sim N(0, (L\,sd)^2 I_2),
 
-    and one Kalman update of all centers gives the mean and the covariance.
+    Mean and covariance of all centers are computed by one Kalman update per pair of neighbors.
 
     Parameters
     ----------

@@ -67,8 +67,8 @@ class LiveClusters:
         self.origins = np.array([c.origin for c in self._clusters]).reshape(-1, 3)
         self._bodies = [i for i, c in enumerate(self._clusters) if c.body is not None]
 
-        # Counts for each part: frames with a pose, and misfits. Count for each marker: misfits in
-        # which it deviated most.
+        # Number of frames with a pose and number of misfits of each part, and number of misfits in
+        # which each marker deviated most.
         self._frames = 0
         self._good = np.zeros(shape[0], dtype=np.int64)
         self._bad = np.zeros(shape[0], dtype=np.int64)

@@ -68,8 +68,8 @@ class LiveJointCenter:
     the other directions.
     """
     total: float
-    """Total error: standard deviation per axis, m, including soft-tissue artefact. Unobserved
-    directions have the prior of the static pose. A calibration stores this value.
+    """Total error, m, as standard deviation per axis, including soft-tissue artefact. In unobserved
+    directions it is the error of the prior of the static pose. A calibration stores this value.
     """
     arc: float
     """Range of the marker directions about the center, rad."""
@@ -135,7 +135,7 @@ class LiveJointCenters:
         self._turn = -1
 
     def fade(self, share: float) -> None:
-        """Multiply the weights of all frames so far by a factor between 0 and 1."""
+        """Multiply the weights of all frames that were processed by a factor between 0 and 1."""
         for sphere in self._spheres:
             sphere.fade(share)
 

@@ -198,7 +198,7 @@ class MovementGuide:
 def _clusters(
     chain: Chain, settings: CalibrationSettings, standing: OpticalTrack | None
 ) -> tuple[dict[str, MarkerCluster], list[str]]:
-    """Return the body parts in the static pose, and the reasons for missing ones."""
+    """Return the body parts in the static pose, and the reasons why body parts are missing."""
     clusters: dict[str, MarkerCluster] = {}
     faults: list[str] = []
     if standing is None:

@@ -1,6 +1,7 @@
 """Arc and flexion count of each joint from the inertial sensors during a functional movement.
 
-The values guide the subject and are computed a few times per second. The fit does not use them.
+The values guide the subject and are computed a few times per second. The fit does not use these
+values.
 """
 
 from __future__ import annotations
@@ -96,14 +97,14 @@ class MovementProgress:
             reach.take(_between(latest[a], latest[b]))
 
     def arcs(self) -> dict[str, float]:
-        """Return the largest arc of each inner joint so far, rad."""
+        """Return the largest arc of each inner joint since the start, rad."""
         arcs: dict[str, float] = {}
         for (joint, _, _), reach in self._seen.items():
             arcs[joint] = max(arcs.get(joint, 0.0), reach.arc)
         return arcs
 
     def bends(self) -> dict[str, int]:
-        """Return the number of flexions of each inner joint so far, over all pairs of sensors."""
+        """Return the number of flexions of each inner joint since the start."""
         bends: dict[str, int] = {}
         for (joint, _, _), reach in self._seen.items():
             bends[joint] = bends.get(joint, 0) + reach.bends

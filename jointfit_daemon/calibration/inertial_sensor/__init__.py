@@ -1,8 +1,8 @@
 """Calibration of one inertial sensor: biases, scale factors and axes from guided movements.
 
-Each step takes the readings of one movement and returns an estimate with its covariance:
-`GyroscopeStep` at rest, `AccelerometerStep` in static poses, `MagnetometerStep` in free rotation.
-The turns between the poses also yield the scale factors of the gyroscope.
+Each step processes the readings of one movement and returns an estimate with its covariance.
+`GyroscopeStep` needs rest, `AccelerometerStep` static poses, and `MagnetometerStep` free rotation.
+The scale factors of the gyroscope are estimated from the turns between the static poses.
 """
 
 from jointfit_daemon.calibration.inertial_sensor._accelerometer import (

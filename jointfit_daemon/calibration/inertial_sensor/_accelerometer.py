@@ -69,7 +69,7 @@ _DISTINCT = cos(radians(20.0))
 """Cosine of the smallest angle between two poses."""
 _PLANES = {"x and y": (0, 1), "x and z": (0, 2), "y and z": (1, 2)}
 _TILTED = 0.4
-"""Smallest share of gravity along both axes of a tilted pose."""
+"""Smallest component of gravity along both axes of a tilted pose, as a fraction of gravity."""
 _SATURATED = 0.5 * STANDARD_GRAVITY
 """Specific force, m/s^2, that every accelerometer measures without saturation."""
 
@@ -122,7 +122,7 @@ def fit_accelerometer(forces: Array) -> AccelerometerEstimate:
             "degrees: repeat, and let the sensor lie still for a second in each pose"
         )
 
-    # the elements of non-orthogonality are used only if the poses determine them
+    # the off-diagonal elements are used only if the poses determine these elements
     unit = forces / STANDARD_GRAVITY
     fit = fit_unit_ellipsoid(unit, DIAGONAL)
     if len(forces) >= FEWEST_SKEWED:

@@ -80,7 +80,7 @@ class GyroscopeScaleEstimate:
 def fit_gyroscope_scale(
     turns: Sequence[Turn], correct: Callable[[Array], Array]
 ) -> GyroscopeScaleEstimate:
-    """Estimate scale factors and, if the turns determine them, axes.
+    """Estimate the scale factors and, if the turns determine the axes, also the axes.
 
     Parameters
     ----------

@@ -1,8 +1,9 @@
 r"""Gauge freedom: directions in which markers may move without changing the tracking error.
 
 For example, all markers of a segment on a ball joint may be rotated about the joint together.
-Inverse kinematics then rotates the segment back: the error is equal, but the joint angle differs.
-Such directions are the null space of the reduced normal matrix of `_simultaneous` without a prior,
+Inverse kinematics then rotates the segment back, so that the error is equal, but the joint angle
+differs. Such directions are the null space of the reduced normal matrix of `_simultaneous` without
+a prior,
 
 .. math:: S = \sum_t C_t - B_t^T A_t^{-1} B_t
 

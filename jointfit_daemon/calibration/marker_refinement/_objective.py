@@ -80,7 +80,7 @@ class RefinementProblem:
         return limits_of(self.model, self.limit_m2)
 
     def excess(self, state: ChainState) -> Array | None:
-        """Return the excess of hinge angles over their limits, rad, (T, nq); None: no limits."""
+        """Return the excess of hinge angles over limits, rad, (T, nq); None without limits."""
         for band in self.limits:
             return np.where(band.weights > 0.0, band.excess(layout_of(self.model), state), 0.0)
         return None

@@ -2,8 +2,9 @@
 
 Positions are refined on the first part of the movement and evaluated on the rest. If the markers of
 a segment do not have a smaller error on the rest, the segment keeps the positions of the model. If
-the error of the whole model is not smaller, all segments keep them. If the model does not fit the
-movement, the fault is reported, and the calibration continues without a refinement.
+the error of the whole model is not smaller, all segments keep the positions of the model. If the
+model does not fit the movement, the fault is reported, and the calibration continues without a
+refinement.
 """
 
 from __future__ import annotations

@@ -135,7 +135,7 @@ def fit_calibration(
     """
     pose = static if isinstance(static, StaticPose) else fit_static(static, settings, chain)
 
-    # Optical reference: body parts, and lags of the sensors relative to them.
+    # The optical reference consists of body parts. Lags of sensors are relative to it.
     refined, tracks = refined_tracks(_tracks(pose, functional, chain), pose, functional, settings)
     moving = _lags(chain, functional, tracks, lag_ns or {})
     lags = _lags_in_use(chain, moving, alignment, _earlier_lags(previous, tracked), lag_ns or {})

@@ -2,7 +2,7 @@
 
 Online learning changes only the models, not sensor-to-segment alignments, joint centers or lags. A
 candidate is fitted to the training frames of the calibration and the older part of the new frames.
-The newest frames are held out. On them the candidate is compared with the models in force. The
+The candidate is compared with the models in force on the newest frames, which are held out. The
 models in force are retained, with a reason, in three cases: the candidate is not better, is much
 worse on the earlier training frames, or differs too much. Inconsistent cameras and sensors are an
 error.

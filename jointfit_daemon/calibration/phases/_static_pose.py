@@ -143,7 +143,7 @@ def fit_static_only(
     else:
         worlds = {name: alignment.world(name) for name in pose.sensors}
 
-    # Models: the equal-weight mean of all sensors of a segment, and each sensor alone.
+    # The models are the equal-weight mean of all sensors of a segment, and each sensor alone.
     models = [
         {
             model_key(alive, None): MeanModel(equal_weights(len(alive)), UNREFERENCED_SD)

@@ -126,7 +126,7 @@ def segment_lags(
 
 
 def tracked_lags(tracked: Mapping[str, tuple[float, float]]) -> dict[str, SensorLag]:
-    """Return lags tracked at run time; their uncertainty is increased by that of soft tissue."""
+    """Return lags tracked at run time, with an uncertainty that includes soft tissue."""
     return {
         name: SensorLag(
             round(lag), hypot(sigma, SENSOR_TISSUE_SD_NS, MARKER_TISSUE_SD_NS), "tracked"

@@ -41,7 +41,7 @@ def joint_error_correlations(
         return {}
     found = {}
     for joint in inner_joints(chain):
-        # For each segment: its sensors, the mean of its neighbor, and its reference.
+        # Collect sensors, mean of the neighbor, and reference of each segment.
         columns = [
             [
                 *(training.sensors[name] for name in chain.sensors[k]),

@@ -73,7 +73,7 @@ def joined(old: LimbTraining, new: LimbTraining) -> LimbTraining:
 
 
 def evenly(chain: Chain, training: LimbTraining, most: int = MOST) -> LimbTraining:
-    """Return at most `most` frames, evenly over postures.
+    """Return at most `most` frames, distributed evenly over postures.
 
     The newest frame of every posture is selected first, then the second newest, and so on. Rare
     postures are thus retained, and the frames of frequent postures are replaced.

@@ -163,7 +163,7 @@ def temper(
     determinant = p * r - q * q
     s, t, u = r / determinant, -q / determinant, p / determinant
 
-    # since S C = R² (I - S), the product S C S needs no third matrix
+    # the product S C S needs no third matrix, because S C = R² (I - S)
     k, m, n = square * (1.0 - s), -square * t, square * (1.0 - u)
     drawn = (k * s + m * t, k * t + m * u, m * t + n * u)
     return s * a + t * b, t * a + u * b, drawn

@@ -1,8 +1,8 @@
 """Circle fit of a stream of points, at constant cost per frame.
 
 Invariant: the result equals the batch fit of all frames with the same weights. Ten sums determine
-the circle, its covariance and the lag-one correlation of the residuals. The sums are plain floats
-because a numpy call on ten numbers takes longer than the arithmetic.
+the circle, its covariance and the lag-one correlation of the residuals. The sums are plain floats,
+because a NumPy call on ten numbers takes longer than the arithmetic.
 """
 
 from __future__ import annotations

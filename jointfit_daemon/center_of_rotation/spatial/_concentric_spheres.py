@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 _STEPS = 40
 _REWEIGHED = 6
 _NOTHING_M2 = 1e-18
-"""Noise variance that counts as rounding, m²: one nanometer squared."""
+"""Noise variance below which it counts as a rounding error, m². It is one nanometer squared."""
 _REACH_M = 1e3
 
 

@@ -114,7 +114,7 @@ def observe(
 
     The fit omits directions that noise dominates. It includes directions that only soft-tissue
     artefact excites, because the residuals would be larger without these directions. The result
-    does not contain them.
+    does not contain the directions of the artefact.
     """
     while basis.shape[1] >= 2:
         flat = paths.seen_along(basis)

@@ -160,7 +160,7 @@ class RunningSphere:
         self._frames += 1 if w is None else int(w.any())
 
     def fade(self, share: float) -> None:
-        """Multiply the weights of all frames so far by a factor between 0 and 1."""
+        """Multiply the weights of all frames that were processed by a factor between 0 and 1."""
         self._M *= share
         self._L *= share
         self._squares *= share**2

@@ -1,7 +1,7 @@
 """Sphere fits of all frames at once.
 
 `fit_sphere` is robust and is the recommended method. The linear fits are for comparison. Invariant:
-acceptance equals that of a `RunningSphere` fed with the same frames.
+a `RunningSphere` accepts or refuses the same frames in the same way.
 """
 
 from __future__ import annotations

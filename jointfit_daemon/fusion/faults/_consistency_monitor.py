@@ -85,7 +85,7 @@ class ConsistencyResult(NamedTuple):
     spread: tuple[float, ...]
     """Standard deviation per axis that is added to each segment, rad."""
     slipped: frozenset[str]
-    """Sensors that contradict all others of their segment: excluded from fusion."""
+    """Sensors that contradict all others of their segment and are excluded from fusion."""
     flags: tuple[str, ...]
 
 

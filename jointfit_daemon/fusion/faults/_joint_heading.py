@@ -33,7 +33,7 @@ LIMIT_SIGMA = 3.0
 """Heading difference at which two segments are inconsistent, in standard deviations of
 the difference without a fault."""
 RESIDUAL_SMOOTHING_S = 0.2
-"""Time constant of the remaining heading difference that enters the uncertainty, s."""
+"""Time constant of the remaining heading difference that is added to the uncertainty, s."""
 
 
 class JointHeadingMonitor:

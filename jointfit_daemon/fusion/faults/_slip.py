@@ -148,7 +148,7 @@ class SlipDetector:
 
     @property
     def consistent(self) -> bool:
-        """Whether the difference may be slow drift: no inconsistency is active or pending."""
+        """Whether no inconsistency is active or pending; the difference may then be drift."""
         return not self.inconsistent and self.distance < self.limit
 
     def clear_excess(self) -> None:

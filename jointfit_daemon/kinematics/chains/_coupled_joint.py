@@ -60,7 +60,7 @@ class CoupledCurve:
 
     @property
     def home(self) -> float:
-        """Coordinate at rest: zero, or the nearest coordinate within the samples."""
+        """Coordinate at rest, which is zero or the nearest coordinate within the samples."""
         return float(np.clip(0.0, self.knots[0], self.knots[-1]))
 
     def at(self, amounts: Array) -> tuple[Array, Array]:

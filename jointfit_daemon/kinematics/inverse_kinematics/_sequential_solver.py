@@ -77,8 +77,8 @@ class LiveOptions:
     two steps.
     """
     huber_m: float | None = None
-    """Huber threshold c of the marker error, m: larger errors have weight c/|e|; None: least
-    squares.
+    """Huber threshold c of the marker error, m. Errors e above c have the weight c/|e|. None is a
+    least-squares fit.
     """
     hold_m2: float = 1e-4
     """Weight of the pose at the last instant for joints that the markers do not determine,

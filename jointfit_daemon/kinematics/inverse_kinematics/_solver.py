@@ -54,8 +54,8 @@ class IkOptions:
     tolerance: float = 1e-7
     """Relative decrease of the squared error at which an instant has converged."""
     huber_m: float | None = None
-    """Huber threshold c of the marker error, m: larger errors have weight c/|e|; None: least
-    squares.
+    """Huber threshold c of the marker error, m. Errors e above c have the weight c/|e|. None is a
+    least-squares fit.
     """
     reweightings: int = 2
     """Number of passes with updated robust weights."""

@@ -1,4 +1,4 @@
-"""Alignment: sample streams interpolated to frames at a fixed rate."""
+"""Alignment of sample streams to frames at a fixed rate, by interpolation."""
 
 from jointfit_daemon.timing.alignment._frame_aligner import AlignedFrame, FrameAligner, Mode
 from jointfit_daemon.timing.alignment._interpolation import CURVATURE_SHARE, extrapolate_orientation

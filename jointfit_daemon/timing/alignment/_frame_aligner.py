@@ -154,7 +154,7 @@ class FrameAligner:
         return outcome
 
     def counts(self, name: str) -> dict[str, int]:
-        """Return the number of received samples by outcome, and of pending ones."""
+        """Return the number of received samples, of samples by outcome, and of pending samples."""
         return self._streams[name].counts()
 
     # --- frames ------------------------------------------------------------------------------

@@ -46,7 +46,9 @@ _EARLY = 20
 _DELAY_STEP = 128
 """The usual delay changes by 1/128 period per sample."""
 _DELAY_UP = 3
-"""Steps up per step down: the usual delay converges to the 75th percentile."""
+"""Size of an increase relative to a decrease of the usual delay, which thus converges to the 75th
+percentile.
+"""
 _BEHIND = 3
 """Number of samples at or before a frame that extrapolation needs."""
 
@@ -59,7 +61,7 @@ class SampleOutcome(StrEnum):
     DECIMATED = "decimated"
     """Skipped, because the stream is faster than the frames."""
     LATE = "late"
-    """Sample that arrived after all frames that needed it."""
+    """Sample that arrived after all frames that needed this sample."""
     DUPLICATE = "duplicate"
     """Sample with the same time as another sample."""
     DROPPED = "dropped"
@@ -293,7 +295,7 @@ class Stream:
         self.waited_for, self.epoch = False, None
 
     def counts(self) -> dict[str, int]:
-        """Return the number of received samples by outcome, and of pending ones."""
+        """Return the number of received samples, of samples by outcome, and of pending samples."""
         outcomes = {outcome.value: count for outcome, count in self._counts.items()}
         return {"received": self._received, **outcomes, "pending": len(self._samples)}
 

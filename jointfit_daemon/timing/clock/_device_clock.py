@@ -92,7 +92,7 @@ class DeviceClock:
         self.minute = DelayStatistics()
         """Delays from sampling instant to arrival, and the sample rate, of the last minute."""
         self.news: deque[ClockEvent] = deque(maxlen=16)
-        """Events to be published; the publisher removes them."""
+        """Events to be published. The publisher removes published events."""
         self._unix_offset_ns: int | None = None
         self._period_ns, self._line = period_ns, MonotonicStamps(period_ns)
         self._arrival_ns = 0
@@ -241,7 +241,7 @@ class DeviceClock:
         return reader.echo_ns(ticks) + reader.to_ns(1) // 2
 
     def feed_sync_edge(self, u: int, v: int, reference: HostTime) -> None:
-        """Add a sync edge: device time `u` is the instant `v` of the `reference`, ns."""
+        """Add a sync edge with device time `u` and time `v` on the clock `reference`, ns."""
         direct = self._direct
         if direct is not None and not isinstance(direct, SyncEdgeFit):
             return  # the device clock is declared to be the host clock
@@ -364,7 +364,7 @@ class DeviceClock:
         return _clock_events.clock_reset_event(u - last_u, elapsed_ns)
 
     def _impossible(self, u: int, arrival_ns: int) -> ClockEvent | None:
-        """Return the event if a sample contradicts the fit: too early, or permanently late."""
+        """Return the event if a sample is too early or permanently late relative to the fit."""
         last_u, doubts = self._line.last_u, self._doubts
         if last_u is None or u <= last_u:
             return None

@@ -55,11 +55,13 @@ _LATE_SHARE_GAIN = 0.02
 _LATE_SHARE_FIRST = 0.2
 """Initial share of late samples."""
 _LATE_SHARE_LEAST = 0.03
-"""Least share of late samples: at least 4 in a row are needed."""
+"""Least share of late samples, with which at least 4 late samples in a row count as a loss."""
 _LATE_SHARE_MOST = 0.65
-"""Largest share of late samples: at most 32 in a row are needed."""
+"""Largest share of late samples, with which at most 32 late samples in a row count as a loss."""
 _LATE_LOG_CHANCE = -14.0
-"""Log-probability of a run of late samples by chance: one in a million."""
+"""Logarithm of the probability of a run of late samples by chance, one in a million, at which the
+samples count as lost.
+"""
 _SILENCE_NS = 2 * NS
 """Silence after which samples without device time cannot be numbered, ns."""
 

@@ -1,7 +1,7 @@
 """Direct time from sync edges with two timestamps, or from a clock declared to be the host clock.
 
-Direct time takes precedence over estimates from arrivals. If an estimate contradicts it, a
-``clock`` event is published.
+Direct time takes precedence over estimates from arrivals. If an estimate contradicts direct time, a
+warning is published.
 
 A sync edge is one instant with two timestamps: u on the device clock, v on the reference clock. The
 line ``v(u)`` through the edges of the last minute relates the two clocks with an accuracy of
@@ -118,7 +118,7 @@ class SyncEdgeFit:
         return self._strays >= _STRAYS or self.reference.epoch != self._epoch
 
     def feed(self, u: int, v: int) -> None:
-        """Add an edge: device time and reference time, ns, in order."""
+        """Add an edge with device time `u` and reference time `v`, ns. Edges must be in order."""
         pairs = self._pairs
         stray = len(pairs) >= _LEAST_PAIRS and abs(v - self._reference_ns(u)) > _STRAY_NS
         self._strays = self._strays + 1 if stray else 0

@@ -59,7 +59,7 @@ class EchoFit:
         self.slope = 0.0
         """d theta / d host time; positive when the server clock runs fast."""
         self.bound_ns = inf
-        """Limit of the constant error: half the smallest round-trip time, ns."""
+        """Limit of the constant error, which is half the smallest round-trip time, ns."""
         self.echoes = 0
         """Number of echoes since the fit started."""
 

@@ -2,7 +2,7 @@
 
 For points ``y = c + s u + D`` with delays D >= 0, a line (c, s) is *feasible* if it lies above no
 point. Near the minimum delay the points have a constant density G per nanosecond of height,
-whatever the shape of the delay distribution. The likelihood of a feasible line is then ``exp(G
+for every shape of the delay distribution. The likelihood of a feasible line is then ``exp(G
 sum_mean)`` with ``sum_mean = c + s mean(u)``. The maximum of the likelihood is the edge of the
 lower convex hull that straddles the mean of u (Moon, Skelly, Towsley, INFOCOM 1999; Zhang, Liu,
 Xia, INFOCOM 2002).

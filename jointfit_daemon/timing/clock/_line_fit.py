@@ -39,7 +39,7 @@ def fit_line(rows: Sequence[tuple[float, float, float]], slope_sd: float) -> Fit
     Parameters
     ----------
     rows : sequence of (float, float, float)
-        At least one.
+        At least one row.
     slope_sd : float
         Prior standard deviation of the slope; its mean is 0.
     """

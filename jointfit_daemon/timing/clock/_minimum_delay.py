@@ -1,4 +1,4 @@
-"""Minimum-delay filter: device clock to host clock from arrival times alone.
+"""Minimum-delay filter, which relates device clock and host clock by arrival times alone.
 
 With device time u and arrival A, the difference ``y = A - u = c + s u + D`` contains a delay ``D >=
 D_min`` of unknown distribution. The filter fits the line below all points (``mean_feasible_line``).
@@ -91,7 +91,7 @@ class MinimumDelayFilter:
         return y - self._y0 - self._c - self.skew * (u - self._ref)
 
     def offset_ns(self, u: int) -> int:
-        """Return the line at `u`, ns: host time minus device time, plus D_min."""
+        """Return the value of the line at `u`, ns: the clock offset plus D_min."""
         return self.at(u)[0]
 
     def sigma_ns(self, u: int) -> float:
@@ -109,7 +109,8 @@ class MinimumDelayFilter:
     def feed(self, u: int, y: int) -> float:
         """Add a point with increasing `u`; return its height above the line, ns.
 
-        A point below the line lowers it immediately, since no sample arrives before it was sent.
+        A point below the line lowers the line immediately, because no sample arrives before it was
+        sent.
         """
         if self._best is None:
             self._y0, self._ref, self._bucket_end = y, u, u + BUCKET_NS

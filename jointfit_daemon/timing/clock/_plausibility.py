@@ -1,4 +1,4 @@
-"""Detection of samples that a fitted clock does not explain: too early, or permanently late.
+"""Detection of samples that are too early or permanently late relative to a fitted clock.
 
 A wire, a queue or an overloaded host may delay samples by any amount without a clock fault. Late
 samples therefore indicate a fault only if the delays of the fastest samples agree for two seconds.

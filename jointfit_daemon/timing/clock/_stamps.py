@@ -12,7 +12,7 @@ from typing import NamedTuple
 STEP_NS = 5_000_000
 """Largest error that is corrected by slewing, ns; a larger one is a step."""
 SLEW = 500e-6
-"""Largest slew rate, dimensionless: correction per elapsed time."""
+"""Largest slew rate (correction per elapsed time), dimensionless."""
 
 
 class Stamp(NamedTuple):

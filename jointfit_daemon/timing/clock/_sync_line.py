@@ -41,7 +41,7 @@ class SyncLine:
         """Number of edges without a match, or with an ambiguous match."""
 
     def instant(self, edge: Edge) -> None:
-        """Add the next instant of the reference: a camera frame or an edge."""
+        """Add the next instant of the reference, which is a camera frame or an edge."""
         instants = self._instants
         if instants and edge.t_ns <= instants[-1].t_ns:
             if instants[-1].t_ns - edge.t_ns < FARTHEST_NS:

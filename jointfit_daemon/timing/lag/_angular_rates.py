@@ -146,7 +146,7 @@ def low_pass(rates: Rates, cutoff_hz: float) -> Rates:
 class Interpolant:
     """Cubic Hermite interpolant of each run.
 
-    Slopes are fourth-order central differences, second order near the ends of a run.
+    Slopes are central differences of fourth order, and of second order near the ends of a run.
     """
 
     def __init__(self, rates: Rates) -> None:

@@ -68,8 +68,8 @@ _AGREE = 0.005
 class LagSettings:
     """Search range of the lag, and the thresholds that an estimate must pass.
 
-    The defaults are for live tracking. ``calibration.registration`` has the thresholds for the
-    plate and the body, and `LagTracker` those for a step of the lag.
+    The defaults are for live tracking. ``calibration.registration`` has other thresholds for the
+    plate and the body. `LagTracker` has the thresholds for a step of the lag.
     """
 
     span_s: float = 0.15
@@ -144,16 +144,16 @@ def estimate_lag(
 ) -> LagEstimate:
     """Estimate the lag between two tracks of orientations.
 
-    The lag of filtered orientations differs from the lag of the gyro: an orientation filter leads
-    its gyro by half its internal period. Each lag applies only to the quantity from which it was
-    estimated.
+    The lag of filtered orientations differs from the lag of the gyro, because an orientation filter
+    leads its gyro by half its internal period. Each lag applies only to the quantity from which it
+    was estimated.
 
     Parameters
     ----------
     imu_t_ns, ref_t_ns : ndarray, shape (n,), (m,)
         Host instants, strictly increasing, ns.
     imu_q, ref_q : ndarray, shape (n, 4), (m, 4)
-        q_world_body of each, each in its own world; rows with NaN are missing poses.
+        q_world_body of each system, each in its own world. Rows with NaN are missing poses.
     settings : LagSettings, optional
         Search range and thresholds.
 
@@ -265,8 +265,8 @@ def _judged(seen: LagEstimate, fits: list[LagFit], settings: LagSettings) -> Lag
 def _best_and_rival(fits: list[LagFit], seen: LagEstimate) -> tuple[LagFit, LagFit | None]:
     """Return the best fit, and another lag that fits nearly as well, or None.
 
-    Without a rival the fit with the smallest residual is best. With rivals the residuals do not
-    decide: the smallest lag is returned, with the rival nearest to it.
+    Without a rival the fit with the smallest residual is best. With rivals the residuals are not
+    decisive. The result is then the smallest lag, and the rival nearest to this lag.
     """
     best = min(fits, key=lambda fit: fit.residual_rms)
     limit = _RIVAL * max(best.residual_rms, _AGREE * seen.rate_rms) ** 2

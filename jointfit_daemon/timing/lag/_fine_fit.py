@@ -31,7 +31,7 @@ ITERATIONS = 30
 """Largest number of iterations."""
 DONE_S = 1e-6
 """Change of the lag, s, that ends the search if reached twice in a row. The rotation is not
-checked: about a single axis of motion it may change without any effect on the lag.
+checked, because it may change about a single axis of motion without any effect on the lag.
 """
 LEAST_PAIRS = 16
 """Least number of compared rates."""
@@ -72,7 +72,7 @@ def fit_lag(
     r"""Fit :math:`r_j = g(t_j + \tau) - b - R\omega_j` over (R, b, tau).
 
     Gauss-Newton on all seven unknowns with Huber weights on |r|; the threshold is chosen by the
-    variance of the lag. The faster track is interpolated at the instants of the slower one.
+    variance of the lag. The faster track is interpolated at the instants of the slower track.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def fit_lag(
         return None
     yield
 
-    # R and b of the exchanged problem: omega = R^T g - R^T b.
+    # The exchanged problem is omega = R^T g - R^T b.
     rot, bias = (state.rot.T, -state.rot.T @ state.bias) if swapped else (state.rot, state.bias)
     norm = np.linalg.norm(linear.residual, axis=1)
     square = float(norm @ norm)
@@ -183,7 +183,7 @@ def _norms(vectors: Floats) -> Floats:
 
 
 def _scale(norm: Floats) -> float:
-    """Return the robust standard deviation per axis of residuals of these norms."""
+    """Return the robust standard deviation per axis of residuals, from their norms."""
     # The median of finite values, in half the time of ``np.median``.
     middle = norm.size // 2
     if norm.size % 2:
@@ -202,8 +202,8 @@ def _clipped(norm: Floats, clip: float) -> Floats:
 def _best_clip(linear: LinearizedLag) -> float:
     r"""Return the threshold, rad/s, with the least variance :math:`\sum h\psi^2 / (\sum h\psi')^2`.
 
-    h is the information of a row about the lag. Correlations between residuals are neglected, since
-    they are the same for all thresholds.
+    h is the information of a row about the lag. Correlations between residuals are neglected,
+    because they are the same for all thresholds.
     """
     norm = _norms(linear.residual)
     scale = _scale(norm)

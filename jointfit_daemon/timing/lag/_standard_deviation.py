@@ -74,7 +74,7 @@ class LinearizedLag(NamedTuple):
     """Weighted linear least-squares problem of one iteration, with n rows of three axes."""
 
     jacobian: Floats
-    """Derivatives by rotation, bias and, last, the lag: shape (n, 3, 7)."""
+    """Derivatives with respect to rotation, bias and, in the last column, lag, shape (n, 3, 7)."""
     residual: Floats
     """Residuals, rad/s, shape (n, 3)."""
     weight: Floats

@@ -47,8 +47,8 @@ class LagTracker:
     Parameters
     ----------
     window_s, hop_s : float
-        Length of a window, and time from one window to the next, s. Overlapping windows are not
-        independent: the variance of their estimates is multiplied by ``window_s / hop_s``.
+        Length of a window, and time from one window to the next, s. The variance of the estimates
+        is multiplied by ``window_s / hop_s``, because overlapping windows are not independent.
     """
 
     __slots__ = ("_drift", "_inflate", "_pp", "_pt", "_refused", "_t_ns", "_tau", "_tt")
