@@ -14,6 +14,8 @@ from jointfit_daemon.outputs.mqtt import NoAnswerError
 from tests.endurance.slopes import RESULTS as ENDURANCE
 from tests.endurance.slopes import table_of
 from tests.faults.gateway import running_gateway
+from tests.faults.peer_table import RESULTS as PEERS
+from tests.faults.peer_table import table_of as peer_table_of
 from tests.load.table import RESULTS as LOAD
 from tests.load.table import table_of as load_table_of
 from tests.mutation.score import RESULTS as MUTATION
@@ -140,6 +142,7 @@ def render(results: dict[str, Any]) -> str:
     load = json.loads(LOAD.read_text("utf-8"))
     page = page.replace("{minutes}", f"{load['seconds'] / 60.0:g}")
     page = page.replace("{load}", load_table_of(load))
+    page = page.replace("{peers}", peer_table_of(json.loads(PEERS.read_text("utf-8"))))
     page = page.replace("{mutation}", _mutation())
     return page.replace("{slopes}", table_of(endurance))
 

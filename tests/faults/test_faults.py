@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING
 
 import pytest
 
+from tests.faults.peer_table import RESULTS as PEERS
+from tests.faults.peer_table import slower_than_a_peer
 from tests.faults.run import PAGE, render, run_all, scenarios, stored
 from tests.system.station import load_factor
 
@@ -30,6 +33,10 @@ def test_stored_results_are_within_the_limits() -> None:
         found = stored()["scenarios"][name]
         assert found["noticed_most_s"] <= scenario.noticed_limit_s, name
         assert found["recovered_most_s"] <= scenario.recovered_limit_s, name
+
+
+def test_no_other_program_recovers_sooner_in_the_stored_results() -> None:
+    assert slower_than_a_peer(json.loads(PEERS.read_text("utf-8"))) == []
 
 
 @pytest.mark.experiment
