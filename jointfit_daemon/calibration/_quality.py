@@ -239,7 +239,10 @@ class HoldoutQuality:
 
 @dataclass(frozen=True, slots=True)
 class RegressionQuality:
-    """Regression coefficients of one segment, with rows w, x, y, z and a column per sensor."""
+    """Regression coefficients of one segment.
+
+    The rows are w, x, y and z. The columns are `sensors` and, last, the intercept.
+    """
 
     sensors: tuple[str, ...]
     q_sign: Quaternion

@@ -22,8 +22,9 @@ if TYPE_CHECKING:
 
 
 TOLERATED = 2.5
-"""Threshold κ of Huber's weight: Mahalanobis distance of an estimate, divided by the root of the
-dimension, above which its weight is reduced."""
+"""Threshold κ of the Huber weight. The weight of an estimate is reduced if its Mahalanobis
+distance, divided by the root of the dimension, exceeds the threshold.
+"""
 _PASSES = 50
 
 

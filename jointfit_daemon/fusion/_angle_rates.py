@@ -1,4 +1,4 @@
-"""Rates of joint angles, as difference quotients over the last 50 ms.
+"""Rates of joint angles, computed as difference quotients over the last 50 ms.
 
 A shorter span would increase the noise of the rate. The rate applies to an instant 25 ms before the
 frame.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from typing_extensions import override  # typing has it from Python 3.12
+from typing_extensions import override  # in typing from Python 3.12 on
 
 from jointfit_daemon.fusion._segment_fuser import FusedSegment, SegmentFuser
 from jointfit_daemon.limb_model import model_key

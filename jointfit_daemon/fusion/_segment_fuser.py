@@ -60,11 +60,12 @@ HOLD_NS = 200_000_000
 """Time for which the last orientation is held if no sensor has data, ns."""
 MINUTE_NS = 60_000_000_000
 HELD_RATE = 2.0
-"""Growth of the standard deviation of a held orientation, rad/s: RMS angular rate of the leg in
-gait."""
+"""Growth of the standard deviation of a held orientation, rad/s. It is the RMS angular rate of the
+leg in gait.
+"""
 
 Inputs = dict[str, "Quaternion"]
-"""Orientation of the segment, q_optical_segment, computed from each sensor alone, by sensor."""
+"""Orientation q_optical_segment by sensor, computed from this sensor alone."""
 Names = tuple[str, ...]
 
 

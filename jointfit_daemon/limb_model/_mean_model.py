@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from typing_extensions import override  # typing has it from Python 3.12
+from typing_extensions import override  # in typing from Python 3.12 on
 
 from jointfit_daemon.limb_model._segment_model import Prediction, SegmentModel
 from jointfit_daemon.limb_model._weighted_mean import fuse, fuse_one

@@ -15,7 +15,7 @@ from math import sqrt
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
-from typing_extensions import override  # typing has it from Python 3.12
+from typing_extensions import override  # in typing from Python 3.12 on
 
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion

@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from math import radians
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
-from typing_extensions import override  # typing has it from Python 3.12
+from typing_extensions import override  # in typing from Python 3.12 on
 
 from jointfit_daemon.limb_model._json_form import fields_form
 

@@ -79,9 +79,8 @@ class JointCenter:
     covariance: Array
     """Covariance of the position, m², shape (3, 3)."""
     source: str
-    """Source of the center. ``fit`` is the movement, ``length`` the other end of a segment and its
-    configured length, and ``midpoint`` the middle between the two distal joints of a branched
-    segment.
+    """Source of the center: ``fit`` (movement), ``length`` (other end of a segment and its
+    configured length) or ``midpoint`` (middle between the two distal joints of a branched segment).
     """
     fit: CenterEstimate | None
     """Center of rotation from the movement; None if `source` is not ``fit``."""
@@ -93,7 +92,7 @@ class JointCenter:
     def source_text(self) -> str:
         """Description of the source of the joint center.
 
-        ``markers`` is a center from the movement, and ``markers, static pose`` a center with a
+        ``markers`` is a center from the movement. ``markers, static pose`` is a center with a
         direction that the movement did not determine. ``configured`` is a center from another joint
         and a configured length. ``midpoint`` is the middle between two joints.
         """
@@ -456,7 +455,7 @@ def _mean_axis(axes: Sequence[FlexionAxis]) -> Array | None:
 
 
 def _shoulder_note(chain: Chain, flags: Sequence[str]) -> list[str]:
-    """Return a note on the segments whose axis comes from a shoulder, with the remedy."""
+    """Return a note on segments whose axis was determined by a shoulder, with the remedy."""
     prefix = FrameFlag.AXIS_FROM_SHOULDER.of("")
     segments = [flag.removeprefix(prefix) for flag in flags if flag.startswith(prefix)]
     if not segments:

@@ -36,7 +36,7 @@ def apply_standing_prior(
     The matrix S selects horizontal components. The horizontal difference of two neighbors at
     distance L is treated as a measurement of zero with standard deviation L sd,
 
-    .. math:: 0 = S (c_i - c_{i+1}) + e, \qquad e \sim N(0, (L\,sd)^2 I_2),
+    .. math:: 0 = S (c_i - c_{i+1}) + e, \qquad e \sim N(0, (L\,sd)^2 I_2)
 
     Mean and covariance of all centers are computed by one Kalman update per pair of neighbors.
 

@@ -3,8 +3,8 @@
 The movement is complete if three conditions hold:
 
 1. The random error of the center of every joint with markers on both sides is below the target.
-2. Every joint whose two segments carry sensors has flexed far and often enough to train the
-   soft-tissue models.
+2. Every joint with sensors on both segments has flexed far and often enough to train the
+soft-tissue models.
 3. The shortest duration has passed.
 
 For each condition that does not hold, a message names the missing movement. When the longest
@@ -51,8 +51,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
 
 MIN_BENDS = 12
-"""Smallest number of flexions of a joint whose two segments carry sensors. Half a minute of steps
-and squats contains this number.
+"""Smallest number of flexions of a joint with sensors on both segments. Half a minute of steps and
+squats contains this number.
 """
 MIN_SEEN = 0.5
 """Smallest fraction of frames with a body part. With fewer frames the fit would be rejected."""

@@ -20,7 +20,7 @@ class JointInstructions(NamedTuple):
     arc: float = radians(40.0)
     """Smallest arc, rad, that a joint must cover to train the soft-tissue models.
 
-    The limit applies to joints whose two segments carry sensors."""
+    The limit applies to joints with sensors on both segments."""
 
 
 _GENERAL_INSTRUCTIONS = JointInstructions("bend and stretch it as far as it goes", "circle it")

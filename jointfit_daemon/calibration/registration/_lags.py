@@ -47,9 +47,9 @@ SKIN = replace(PLATE, max_sigma_ns=5e6, min_r2=0.7, min_weight=0.5)
 """
 
 SENSOR_TISSUE_SD_NS = 2e6
-"""Standard deviation of the lag due to soft tissue under a sensor, ns."""
+"""Standard deviation of the lag that soft tissue under a sensor causes, ns."""
 MARKER_TISSUE_SD_NS = 3e6
-"""Standard deviation of the lag due to soft tissue under the markers of a segment, ns."""
+"""Standard deviation of the lag that soft tissue under the markers of a segment causes, ns."""
 MAX_PRIOR_DEVIATION = 4.0
 """Difference between the lags on the plate and in the movement, in standard deviations, above which
 a clock or filter must have changed. The later lag is then used.

@@ -35,7 +35,7 @@ def fit_kernel(training: SegmentTraining) -> KernelModel:
 
 
 def fit_kernel_with_residuals(training: SegmentTraining) -> tuple[KernelModel, Array]:
-    """Fit both experts and the trend; widths, penalties and variances come from held-out groups.
+    """Fit both experts and the trend; held-out groups determine widths, penalties and variances.
 
     Groups are blocks in time and, with several trials, whole trials.
 

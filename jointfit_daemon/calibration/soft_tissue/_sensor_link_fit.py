@@ -14,7 +14,7 @@ neighboring frames are similar, so the n frames count as
 
 .. math:: m = n \Big/ \Bigl(1 + 2 \sum_{k=1}^{K} \rho_k\Bigr)
 
-with the autocorrelation :math:`\rho` of the residuals up to its first zero crossing.
+where :math:`\rho` is the autocorrelation of the residuals, up to its first zero crossing.
 """
 
 from __future__ import annotations

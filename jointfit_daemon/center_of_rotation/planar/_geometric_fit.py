@@ -91,7 +91,7 @@ def geometric_estimate(
 
 
 def _descend(x: Array, seen: NDArray[np.bool_], c: Array, *, robust: bool) -> tuple[Array, Array]:
-    """Return the center and Huber's weights of the points, shape (n, k)."""
+    """Return the center and the Huber weights of the points, shape (n, k)."""
     weights: Array = seen.astype(np.float64)
     mu = 1e-3
     for _ in range(_PASSES):

@@ -1,7 +1,7 @@
 """Center of rotation from a marker path and the measured angle of the child segment.
 
-Positions and angles both have errors. Invariant: the result stays within a bounded number of
-standard errors of the circle fit, even with arbitrary angle errors.
+Positions and angles both have errors. Invariant: the distance of the result from the circle fit is
+a bounded number of standard errors, even with arbitrary angle errors.
 """
 
 from __future__ import annotations
@@ -220,7 +220,7 @@ def _path_noise(x: Array) -> float:
     circle = fit_circles(x)
     if bool(circle.valid):
         return float(circle.noise)
-    # A nearly straight arc: the noise is measured across the path, or about a flat parabola.
+    # The arc is nearly straight. The noise is measured across the path, or about a flat parabola.
     d = x - x.mean(axis=0)
     along, across = (d @ np.linalg.svd(d, full_matrices=False)[2].T).T
     terms = np.column_stack((np.ones(len(x)), along, along**2))

@@ -150,9 +150,9 @@ def equal_step_error(step: ArrayLike, noise: ArrayLike) -> Array:
     .. math:: E^2 = \sigma^2 \frac{2 + \cos\alpha}{(1 - \cos\alpha)^2 (1 + \cos\alpha)}
 
     where α is the step and σ the noise. Source: Akbarifar et al. 2021, equation 15, which is of
-    first order in the noise. E is the Cramér-Rao bound of three points. The prediction holds while
-    noise/radius is below (1 - cos α)/6; above this ratio the error has no finite mean square. The
-    minimum of E is 1.155 σ at 120°.
+    first order in the noise. E is the Cramér-Rao bound of three points. The prediction is valid
+    while noise/radius is below (1 - cos α)/6; above this ratio the error has no finite mean square.
+    The minimum of E is 1.155 σ at 120°.
 
     Parameters
     ----------

@@ -55,7 +55,8 @@ class SphereLimits:
     min_direction: float = 0.0
     """RMS rotation of the markers in the third direction, rad, below which the joint counts as a
     hinge even with small noise. Use 3° with soft-tissue artefact. The value must exceed the
-    rotation of the parent's frame due to noise, which cannot be distinguished from joint rotation.
+    rotation of the parent's frame that noise causes, because it cannot be distinguished from joint
+    rotation.
     """
     min_arc: float = radians(8.0)
     reach: tuple[float, float] = (0.02, 1.0)

@@ -1,7 +1,7 @@
 """Sphere fits of all frames at once.
 
 `fit_sphere` is robust and is the recommended method. The linear fits are for comparison. Invariant:
-a `RunningSphere` accepts or refuses the same frames in the same way.
+a `RunningSphere` that processed the same frames accepts or refuses the same centers.
 """
 
 from __future__ import annotations

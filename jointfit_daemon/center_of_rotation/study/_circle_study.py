@@ -172,7 +172,7 @@ def uniform_arc_rms(arc: float, frames: int, noise: float, *, known_radius: bool
     arc : float
         Arc φ, rad, above zero.
     frames : int
-        n.
+        Number of frames n.
     noise : float
         Standard deviation of each coordinate, m.
     known_radius : bool

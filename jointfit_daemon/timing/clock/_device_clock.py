@@ -53,13 +53,13 @@ _ARRIVAL, _COUNTER, _TICKS = range(3)
 _JITTER_GAIN = 0.01
 """Gain of the running mean of the jitter."""
 _ARRIVAL_SIGMA = 0.1
-"""Least standard deviation of samples numbered by arrival, periods."""
+"""Least standard deviation of timestamps of samples that are numbered by arrival, periods."""
 _PRIOR_SIGMAS = 4.0
-"""Standard deviations by which a direct time may differ from the estimate."""
+"""Largest difference between direct time and the estimate, in standard deviations."""
 _AWAY_SHARES = 0.0, 0.02, 0.001
-"""Relative tolerance of device time while the port was closed, by source."""
+"""Relative tolerance of device time while the port was closed, for each source of device time."""
 _SKEW_CHECK_SAMPLES = 256
-"""Samples between two plausibility checks of the skew."""
+"""Number of samples between two plausibility checks of the skew."""
 
 
 class DeviceClock:
@@ -108,8 +108,9 @@ class DeviceClock:
         self._direct: DirectTime | None = None
         self._refused = self._state_direct = self._synced = False
         self._away_since_ns: int | None = None
-        """Instant of the last sample before the port was closed, ns, until a sample determines
-        whether the device restarted."""
+        """Instant of the last sample before the port was closed, ns. It is reset to None when a
+        sample determines whether the device restarted.
+        """
         self._line.last_u = None
         self._doubts = PlausibilityMonitor()
 

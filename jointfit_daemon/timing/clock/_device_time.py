@@ -39,7 +39,7 @@ delays.
 _SILENCE_SHARE = 0.1
 """Largest difference of device time and host time over a silence, share of the silence."""
 _BACKLOG_NS = 100_000_000
-"""Least delay of a backlog, ns, and tolerance of the first sample after it."""
+"""Least delay of a backlog, ns, and tolerance of the first sample after the backlog."""
 _WRAP_SLACK = 8
 """Counts by which a wrap may differ from the elapsed time while the counter width is unknown."""
 _LATE = 0.65

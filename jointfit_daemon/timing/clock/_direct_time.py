@@ -86,7 +86,7 @@ class DeclaredOffset(NamedTuple):
 
 
 class SyncEdgeFit:
-    """Relation of two clocks, fitted to the edges that both have timestamps of.
+    """Relation of two clocks, fitted to edges with timestamps of both clocks.
 
     Parameters
     ----------

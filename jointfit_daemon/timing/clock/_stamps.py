@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 STEP_NS = 5_000_000
-"""Largest error that is corrected by slewing, ns; a larger one is a step."""
+"""Largest error that is corrected by slewing, ns. A larger error is a step."""
 SLEW = 500e-6
 """Largest slew rate (correction per elapsed time), dimensionless."""
 
@@ -105,7 +105,7 @@ class MonotonicStamps:
         return t, step
 
     def forward(self, t: int) -> int:
-        """Return `t`, or the first instant after all timestamps returned so far."""
+        """Return `t`, or the first instant after all timestamps that were returned."""
         if self._newest is not None and t <= self._newest:
             t = self._newest + 1
         self._newest = t

@@ -1,8 +1,8 @@
 """Matching of the sync edges of a device to the instants of the reference clock.
 
-All devices on a sync line stamp the same physical edges. Arrival-based clock estimates are accurate
-to a few milliseconds. Two timestamps therefore belong to the same edge if their estimated host
-times are close compared with the interval between edges.
+All devices on a sync line assign timestamps to the same physical edges. Arrival-based clock
+estimates are accurate to a few milliseconds. Two timestamps therefore belong to the same edge if
+their estimated host times are close compared with the interval between edges.
 """
 
 from __future__ import annotations

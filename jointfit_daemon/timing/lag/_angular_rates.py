@@ -32,7 +32,7 @@ symmetric, and the gap is shorter than the cut-off period. Longer gaps split the
 _KAISER = 5.0
 """Shape parameter of the Kaiser window."""
 _MOST_ANGLE = np.pi / 2
-"""Largest rotation between two poses, rad; a larger one is ambiguous."""
+"""Largest rotation between two poses, rad. A larger rotation is ambiguous."""
 _STENCIL = 5
 """Samples of the fourth-order difference."""
 

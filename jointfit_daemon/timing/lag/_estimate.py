@@ -8,7 +8,7 @@ Two rigidly connected bodies have the same angular rate up to a constant rotatio
 
 .. math:: g(t + \tau) = R\,\omega(t) + b + n ,
 
-with g and omega in their respective body frames. The lag tau is **IMU timestamp minus mocap
+where g and omega are in the respective body frames. The lag tau is **IMU timestamp minus mocap
 timestamp of the same event**: positive when the IMU is later. To align the systems, subtract the
 lag from the IMU timestamps. The lag contains all delays that the clocks cannot observe: constant
 transport delay, filters in both systems, and exposure conventions.
@@ -102,7 +102,7 @@ class LagSettings:
     min_valid: float = 0.8
     """Least fraction of the window without gaps."""
     max_bias: float = radians(10.0)
-    """Largest rate bias, rad/s; a larger one indicates wrong units or a wrong stream."""
+    """Largest rate bias, rad/s. A larger bias indicates wrong units or a wrong stream."""
 
 
 @dataclass(frozen=True, slots=True)

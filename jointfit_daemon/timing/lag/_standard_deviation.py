@@ -57,7 +57,7 @@ whose rate is anticorrelated over short times.
 SIGMAS = 2.8
 """Normal quantile at which the tail probabilities are matched."""
 STAMP_PERIODS_S = (1.95, 3.9)
-"""Periods of the sawtooth error of the stamps, s; the larger variance is used.
+"""Periods of the sawtooth error of the timestamps, s; the larger variance is used.
 
 The period is the tick divided by the relative skew, 0.5 ms by 257 ppm in recordings
 (``lag-all-trials``); the second period belongs to half the skew. A slower sawtooth is nearly
@@ -99,7 +99,7 @@ def lag_sigma(solved: LinearizedLag, memory_s: float, stamp_sd_s: float = 0.0) -
     memory_s : float
         Time over which the low-pass filter correlates residuals, s.
     stamp_sd_s : float
-        Standard deviation of the slowly varying error of the stamps, s.
+        Standard deviation of the slowly varying error of the timestamps, s.
     """
     normal, gradient = _curvature(solved)
     whole = normal.sum(axis=0)
@@ -127,7 +127,7 @@ def lag_sigma(solved: LinearizedLag, memory_s: float, stamp_sd_s: float = 0.0) -
 
 
 def _unobserved_sawtooth(t_s: Floats, information: Floats, memory_s: float) -> float:
-    """Return the standard deviation of the lag due to a sawtooth error of the stamps.
+    """Return the standard deviation of the lag that a sawtooth error of the timestamps causes.
 
     The sawtooth has unit standard deviation. The scatter of the sawtooth between blocks is not
     included.
