@@ -57,7 +57,7 @@ class CanReception:
         self._settings = settings
         self._configured_by = configured_by
         self._worked = False
-        self._first_s = settings.silence_s  # waiting is cheap; opening the bus again is not
+        self._first_s = settings.silence_s  # waiting costs less than reopening
 
     async def run(
         self,

@@ -125,7 +125,7 @@ class SerialConversation(Generic[Message]):
             self.understood += len(messages)
             for message in messages:
                 if is_reply(message):
-                    if not self._emitting:  # it and the bytes behind it; all later bytes follow
+                    if not self._emitting:  # emit the reply and all later bytes
                         since = self._codec.fed - message.end + message.size
                         data, self._recent = self._recent[-since:], b""
                         self._emitting = True

@@ -220,7 +220,7 @@ def check_sensors(imus: Sequence[Mapping[str, Any]], table: ChainTable | None) -
             key = f"imu[{imu_name(imu, at)}].segment"
             yield from check_known_name(key, imu["segment"], table.segments, "segment")
     if any(not isinstance(imu.get("segment"), str) for imu in imus):
-        return  # already reported; may be the segment without sensor
+        return  # already reported; this sensor may be on any segment
     for segment in table.segments:
         if segment not in worn and table.motion != "planar":
             yield Fault("imu", f"segment {segment!r} has no sensor, expected at least one")
@@ -481,7 +481,7 @@ def _numbers(ids: object) -> Iterator[tuple[str, int]]:
     faulty = any(
         field.default is not None and getattr(ids, name) is None for name, field in fields.items()
     )
-    if callable(resolved) and not faulty:  # no identifier is derived from a wrong one
+    if callable(resolved) and not faulty:  # never derive identifiers from a wrong one
         ids = resolved()
     if isinstance(ids, BaseModel):
         ids = dict(ids)

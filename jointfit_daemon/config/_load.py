@@ -400,7 +400,7 @@ class _RigReader:
         self, key: str, table: dict[str, Any], base: type[BaseModel]
     ) -> type[Driver] | None:
         name = table.get("driver")
-        if not isinstance(name, str):  # the settings model reports the fault
+        if not isinstance(name, str):  # the model of the settings reports the fault
             return _likely_driver(None, table, base)
 
         try:

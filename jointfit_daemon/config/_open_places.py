@@ -72,7 +72,7 @@ def fill_open_places(table: Mapping[str, Any]) -> tuple[dict[str, Any], list[Fau
 def _filled_cameras(mocap: Mapping[str, Any]) -> tuple[dict[str, Any], list[Fault]]:
     filled, faults = dict(mocap), []
     if mocap.get("server") == LATER:
-        filled["server"] = "192.0.2.1"  # an address for documentation
+        filled["server"] = "192.0.2.1"  # address reserved for documentation
         faults.append(Fault("mocap.server", _SERVER, LATER))
     if mocap.get("plate") == LATER:
         filled["plate"] = f"{LATER}-plate"

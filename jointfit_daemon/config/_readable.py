@@ -59,13 +59,13 @@ def readable_part(table: Mapping[str, Any], model: type[Model], wrong: _Location
 def _readable(value: Any, annotation: Any, wrong: _Locations) -> Any:
     """Return the readable part of `value`; None if there is none."""
     if isinstance(value, dict) and get_origin(annotation) is tuple:
-        value = [value]  # a driver that accepts one table instead of an array of tables
+        value = [value]  # some drivers accept one table instead of an array
     if not wrong:
         return _valid(value, annotation)
     if isinstance(value, dict) and UNREADABLE in value:
         return None
 
-    choices = [annotation, *get_args(annotation)]  # for X | None: X
+    choices = [annotation, *get_args(annotation)]  # the X of X | None
     for choice in choices:
         if isinstance(choice, type) and issubclass(choice, BaseModel) and isinstance(value, dict):
             return readable_part(value, choice, wrong)

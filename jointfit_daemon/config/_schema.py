@@ -50,7 +50,7 @@ def rig_schema() -> dict[str, Any]:
     for name, model in drivers.items():
         properties = defs[at[model]["$ref"].rpartition("/")[2]]["properties"]
         properties["driver"] = {"const": name, "description": "driver name"}
-        if "can" in properties:  # a name in the file; a table for the driver
+        if "can" in properties:  # the file contains a name, the driver gets a table
             properties["can"] = {"type": "string", "description": "name of a [can.NAME] table"}
 
     imus = [at[model] for model in drivers.values() if issubclass(model, ImuSettings)]

@@ -153,7 +153,7 @@ class ChainRefinementTable(Settings):
     @override
     def contradictions(self) -> Iterator[tuple[str, str]]:
         """Yield options that exclude each other."""
-        first_mm: float | None = self.first_step_mm  # None: cannot be read
+        first_mm: float | None = self.first_step_mm  # None: key cannot be read
         last_mm: float | None = self.threshold_mm
         if first_mm is not None and last_mm is not None and last_mm > first_mm:
             yield "threshold_mm", f"expected first_step_mm = {first_mm:g} or less"
@@ -376,7 +376,7 @@ class MqttSettings(Settings):
     @classmethod
     def _check_insecure(cls, insecure: bool, info: ValidationInfo) -> bool:
         if not {"host", "tls"} <= info.data.keys():
-            return insecure  # they are faulty, and reported
+            return insecure  # these keys are faulty and already reported
         host: str = info.data["host"]
         if not (insecure or info.data["tls"] is not None or is_this_host(host)):
             raise ValueError(

@@ -237,7 +237,7 @@ def _verify_bytes(recording: Recording) -> Verification:
             continue
         comparison.now_ns = max(comparison.now_ns, item.t_ns)
         if until_s is not None or difference is not None:
-            continue  # only the gaps and the duration are of interest
+            continue  # only gaps and duration are needed
         if item.channel.startswith(_OUTPUT):
             difference = comparison.compare(item)
         elif (event := item.event()) is not None:

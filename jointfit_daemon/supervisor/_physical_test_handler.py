@@ -162,7 +162,7 @@ class PhysicalTestHandler:
         """Reopen the sensor, so that the test receives its replies to the driver."""
         self._stop()
         await self._daemon.restart_device(source.id)
-        self._stop()  # events of a start at the same time
+        self._stop()  # the restart causes events at the same time
         self._running = RunningPhysicalTest(source)
         self._daemon.subscribe(self._running)
         self._too_late = asyncio.get_running_loop().call_later(OPEN_S, self._note_silence)

@@ -143,7 +143,7 @@ class Daemon:
         self._overload = OverloadMonitor()
         self._recorder: Recorder | None = None
         self._state_fault: str | None = None
-        self._state_lock: int | None = None  # None if it was writable at the start
+        self._state_lock: int | None = None  # stays None if the folder was writable at the start
         self._calibration: CalibrationStatus | None = None
         self._health_due_s = 0.0
         self._reload_requested = asyncio.Event()

@@ -73,7 +73,7 @@ def _control(answer_fd: int) -> JobControl:
 
 
 def _exit_with_parent() -> None:
-    os.read(sys.stdin.fileno(), 1)  # not the buffered reader: its lock would delay a normal end
+    os.read(sys.stdin.fileno(), 1)  # the lock of the buffered reader would delay a normal end
     os._exit(1)
 
 

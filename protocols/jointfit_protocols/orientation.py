@@ -1,7 +1,7 @@
-"""Conversion of a device's quaternion to the canonical one, and a check of its norm.
+"""Conversion of a device's quaternion to the canonical orientation, and a check of its norm.
 
-Canonical is Hamilton, scalar first, unit, sensor to world, world ENU with z up. Only the world is
-changed: the sensor axes are those printed on the housing.
+A canonical orientation is a Hamilton unit quaternion, scalar first, from sensor to an ENU world
+with z up. The conversion changes only the world. The sensor axes remain as printed on the housing.
 
 | native world | v_ENU from native (1, 2, 3) | q_enu_native  |
 |--------------|-----------------------------|---------------|
@@ -21,24 +21,25 @@ World = Literal["ENU", "NED", "NWU"]
 
 _S = sqrt(0.5)
 _CHECKED = 100
-"""Samples after which the share of rejected ones is evaluated."""
+"""Number of samples after which the share of rejected samples is checked."""
 _MOST_REJECTED = 90
-"""Rejected samples, of `_CHECKED`, that only a wrong byte order or scale explains."""
+"""Number of rejected samples, out of `_CHECKED`, that only a wrong byte order or scale can
+explain."""
 
 
 def canonical(
     native: Quaternion, world: World = "ENU", *, world_to_sensor: bool = False
 ) -> Quaternion:
-    """Convert `native` (w, x, y, z, any norm) to sensor-to-ENU, with the same norm.
+    """Convert `native` (w, x, y, z, any norm) to an orientation from sensor to ENU, same norm.
 
     Parameters
     ----------
     native : Quaternion
-        As sent, scalar first.
+        Quaternion as sent, scalar first.
     world : World
-        World of the device.
+        World to which the quaternion of the device refers.
     world_to_sensor : bool
-        Whether the device sends the inverse.
+        Whether the device sends the inverse rotation.
     """
     w, x, y, z = native
     if world_to_sensor:
@@ -51,7 +52,7 @@ def canonical(
 
 
 def native_of(q_world_sensor: Quaternion, world: World = "ENU") -> Quaternion:
-    """Return the quaternion that a device with `world` sends for a canonical orientation."""
+    """Return the quaternion that a device with this world sends for a canonical orientation."""
     w, x, y, z = q_world_sensor
     if world == "ENU":
         return (w, x, y, z)
@@ -74,13 +75,13 @@ def angles_quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:
 
 
 class OrientationGate:
-    """Rejects quaternions that are not finite or not of norm 1; normalises the others.
+    """Rejects quaternions that are not finite or whose norm is not 1, and normalises the others.
 
     Parameters
     ----------
     tolerance : float
-        Largest deviation of the norm from 1. 0.01 suits floats and fine integers, 0.05 integers in
-        thousandths. A constant small error is normal.
+        Largest deviation of the norm from 1. Use 0.01 for floats and fine integers, and 0.05 for
+        integers in thousandths. A constant small error is normal.
     """
 
     def __init__(self, tolerance: float = 0.01) -> None:
@@ -113,19 +114,19 @@ class OrientationGate:
 
     @property
     def judged(self) -> bool:
-        """Whether `misconfigured_norm` is final."""
+        """Whether enough samples were checked, so that `misconfigured_norm` is final."""
         return self._checked >= _CHECKED
 
     @property
     def misconfigured_norm(self) -> float | None:
-        """Median norm, if more than 90 of the first 100 samples were rejected; otherwise None.
+        """Median norm if more than 90 of the first 100 samples were rejected; None otherwise.
 
-        Byte order or scale are then wrong. NaN if no norm was finite.
+        In this case byte order or scale are wrong. The value is NaN if no norm was finite.
         """
         if self._checked < _CHECKED or self._rejected <= _MOST_REJECTED:
             return None
         return median(self._norms) if self._norms else float("nan")
 
     def forget(self) -> None:
-        """Restart sign continuity: the device restarted."""
+        """Restart the continuity of signs, because the device restarted."""
         self._last = (1.0, 0.0, 0.0, 0.0)

@@ -1,10 +1,12 @@
 """Splitting of a byte stream into packets whose header contains their size.
 
-A packet is not a TCP segment: it arrives in any pieces. After a header that no packet can have, the
-next packet cannot be found; the connection must then be closed, and all further bytes are corrupt.
+A packet does not correspond to a TCP segment, so it may arrive in several parts. After an invalid
+header, the next packet cannot be found. The connection must then be closed, and all further bytes
+are corrupt.
 
-Invariant: the result does not depend on the pieces. At most one incomplete packet is stored, so
-memory is bounded by the largest size that a protocol accepts; time is linear in the bytes.
+Invariant: the result does not depend on the boundaries of the received parts. At most one
+incomplete packet is stored, so the memory is limited by the largest size that a protocol accepts.
+The time is proportional to the number of bytes.
 """
 
 from __future__ import annotations
@@ -18,15 +20,15 @@ if TYPE_CHECKING:
 
 
 class PacketStream:
-    """Splits a byte stream into whole packets.
+    """Splits a byte stream into complete packets.
 
     Parameters
     ----------
     header_bytes : int
-        Bytes of a header.
+        Number of bytes of a header.
     size_of : callable
-        Returns the size of the packet whose header begins at a place of a buffer, header included;
-        None if no packet has this header.
+        Function that returns the size of the packet whose header begins at an index of a buffer,
+        including the header. It returns None if the header is invalid.
     """
 
     def __init__(self, header_bytes: int, size_of: Callable[[bytearray, int], int | None]) -> None:
@@ -34,10 +36,10 @@ class PacketStream:
         self._size_of = size_of
         self._buffer = bytearray()
         self.broken = False
-        """Whether a header was invalid, so that no further packet can be found."""
+        """Whether a header was invalid. In this case no further packet can be found."""
 
     def feed(self, data: bytes) -> list[bytes | CorruptBytes]:
-        """Return the packets that `data` completes; never raises."""
+        """Return the packets that `data` completes; never raise."""
         if self.broken:
             return [CorruptBytes(len(data), "after an invalid packet header")] if data else []
 

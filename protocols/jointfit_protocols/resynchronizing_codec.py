@@ -1,11 +1,11 @@
-"""Search of a byte stream for messages whose beginning, length and checksum may be corrupt.
+"""Search of a byte stream for messages whose start, length or checksum may be corrupt.
 
-A message is a candidate until its checksum is correct. A valid message may begin inside a corrupt
-candidate; after one, the search therefore continues at its second byte.
+A possible message is a candidate until its checksum is correct. A valid message may begin inside a
+corrupt candidate. After a corrupt candidate, the search therefore continues at its second byte.
 
-Invariant: the result does not depend on the pieces in which the bytes arrive, and every byte
-belongs to one message or one run of corrupt bytes. At most one incomplete candidate is stored, so
-memory is bounded by the largest message that a protocol accepts.
+Invariant: the result does not depend on the boundaries of the byte strings that are fed. Every byte
+belongs to one message or to one run of corrupt bytes. At most one incomplete candidate is stored,
+so the memory is limited by the largest message that a protocol accepts.
 """
 
 from __future__ import annotations
@@ -21,37 +21,37 @@ if TYPE_CHECKING:
 
 
 class StreamMessage(Protocol):
-    """Message of a byte stream."""
+    """Interface of a message in a byte stream."""
 
     @property
     def end(self) -> int:
-        """Number of bytes fed to the codec up to and including the last byte of the message."""
+        """Number of bytes fed to the codec until the end of the message."""
 
 
 M = TypeVar("M", bound=StreamMessage)
 
 
-@mypyc_attr(allow_interpreted_subclasses=True)  # for driver packages of others
+@mypyc_attr(allow_interpreted_subclasses=True)  # for driver packages of other authors
 class ResynchronizingCodec(Generic[M]):
-    """Decoder of pieces of any size to messages.
+    """Codec that converts byte strings of any size to messages.
 
-    A run of bytes without a message becomes one `CorruptBytes`: before the message that ends it, at
-    `flush`, or every `longest_run` bytes.
+    A run of bytes without a message becomes one `CorruptBytes`. It is returned before the message
+    that ends the run, at `flush`, or after `longest_run` bytes.
 
     Parameters
     ----------
     read : callable
-        Returns the message that begins at a place of a buffer; None if its last bytes are missing;
-        without a message the number of bytes to skip and the reason. Its third argument is the
-        number of bytes fed before the buffer.
+        Function that returns the message that begins at an index of a buffer, or None if the
+        message is incomplete. If there is no message, it returns the number of bytes to skip and
+        the reason. Its third argument is the number of bytes fed before the buffer.
     start : re.Pattern
-        Matches every place where `read` does not return the reason `no_start`.
+        Pattern that matches wherever `read` does not return the reason `no_start`.
     longest_run : int
-        Number of bytes without a message after which these bytes are reported.
+        Number of bytes without a message after which they are reported.
     no_start : str
-        Reason of bytes outside all candidates.
+        Reason for bytes outside of all candidates.
     shortest : int
-        Bytes at the end of the input that contain no message if they are fewer.
+        Smallest number of bytes that can contain a message.
     """
 
     def __init__(
@@ -67,13 +67,13 @@ class ResynchronizingCodec(Generic[M]):
         self._no_start = no_start
         self._shortest = shortest
         self._run = CorruptRun(longest_run, no_start)
-        self._pending = b""  # under one message between calls
+        self._pending = b""  # less than one message between calls
         self.fed = 0
         """Number of bytes fed so far."""
         self.messages = 0
-        """Messages so far."""
+        """Number of messages so far."""
         self.checksum_failures = 0
-        """Complete candidates with a wrong checksum so far."""
+        """Number of complete candidates with a wrong checksum so far."""
 
     @property
     def pending(self) -> int:
@@ -86,7 +86,7 @@ class ResynchronizingCodec(Generic[M]):
         return self._run.discarded
 
     def feed(self, data: bytes) -> list[M | CorruptBytes]:
-        """Return the messages that `data` completed, in wire order; never raises."""
+        """Return the messages that `data` completes, in wire order; never raise."""
         if not data:
             return []
         buffer = self._pending + data
@@ -94,7 +94,7 @@ class ResynchronizingCodec(Generic[M]):
         self.fed += len(data)
         base = self.fed - end
         item = self._read(buffer, 0, base)
-        if (  # the usual piece is one message
+        if (  # usually `data` is exactly one message
             item is not None
             and type(item) is not CorruptBytes
             and item.end == self.fed
@@ -122,10 +122,11 @@ class ResynchronizingCodec(Generic[M]):
         return found
 
     def flush(self) -> list[M | CorruptBytes]:
-        """End the input, or a silence: return messages hidden in the pending bytes."""
+        """End the input, or a silence; return messages that the pending bytes contain."""
         found: list[M | CorruptBytes] = []
         while self._pending:
-            # the pending bytes begin with a candidate that is cut off: search behind its first byte
+            # The pending bytes begin with an incomplete candidate. The search continues after its
+            # first byte.
             count = len(self._pending) if len(self._pending) < self._shortest else 1
             self._run.add(count, CUT_OFF, found)
             rest, self._pending = self._pending[count:], b""
@@ -137,7 +138,7 @@ class ResynchronizingCodec(Generic[M]):
     def _skip(
         self, buffer: bytes, at: int, fault: CorruptBytes, found: list[M | CorruptBytes]
     ) -> int:
-        """Add the bytes without a message at `at` to the run; return their number."""
+        """Add the bytes without a message at `at` to the run, and return their number."""
         count, reason = fault
         if reason == self._no_start:
             start = self._start.search(buffer, at + 1)

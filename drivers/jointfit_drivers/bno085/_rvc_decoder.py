@@ -85,7 +85,7 @@ class RvcDecoder(SerialMessageDecoder[RvcFrame]):
         arrival_ns = self._arrival_of(message)
         x, y, z = message.acceleration
         force = (_FORCE * x, _FORCE * y, _FORCE * z)
-        if q is not None:  # the norm is 1 but for rounding
+        if q is not None:  # the norm is 1 except for rounding
             out.append(ImuSample(arrival_ns, q, native, None, message.number, acceleration=force))
         if self._compared < _COMPARED:
             out += self._compare(message)

@@ -106,7 +106,7 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
     def contradictions(self) -> Iterator[tuple[str, str]]:
         """Yield the keys whose fields do not fit the frames."""
         if not self._is_readable():
-            return  # reported; nothing can be placed
+            return  # already reported; no positions are known
         faults = list(self._id_faults())
         yield from faults
         if faults:

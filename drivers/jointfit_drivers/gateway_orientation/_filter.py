@@ -175,7 +175,7 @@ class GatewayOrientation:
     ) -> None:
         self._nominal_ns = 1e9 / rate_hz
         self._settle_ns = round(settle_s * _NS)
-        self._started_ns: int | None = None  # None: it has settled
+        self._started_ns: int | None = None  # None: the filter has settled
         self._magnetic = magnetometer
         self._filter: Any = None
         self._last: RawReading | None = None
@@ -257,7 +257,7 @@ class GatewayOrientation:
         # Only the most recent readings are stored, however long the filter settles.
         self._withheld = deque(maxlen=ceil(SETTLE_S * _NS / period_ns) + MOST_MISSING)
         self._estimator = None
-        self._filter = import_module("vqf").VQF(period_ns / _NS)  # an extra
+        self._filter = import_module("vqf").VQF(period_ns / _NS)  # ``vqf`` is an extra
         # The integrated orientations assume a constant bias until the start is estimated.
         self._filter.setMotionBiasEstEnabled(not (self._magnetic and self.settling))
 

@@ -74,7 +74,7 @@ class LpmsCanSettings(CanImuSettings, LpmsConventionSettings):
     @override
     def contradictions(self) -> Iterator[tuple[str, str]]:
         """Yield identifiers that the mode does not permit, and channels that do not exist."""
-        known: Any = (self.mode, self.ids, self.precision, self.mapping)  # None: cannot be read
+        known: Any = (self.mode, self.ids, self.precision, self.mapping)  # None: key cannot be read
         if None in known:
             return
         frames = self.ids.frames

@@ -136,7 +136,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
         message, arrival_ns = arrived
         measurement = self._layout.decode(message.data)
         if measurement is None or "quaternion" not in self._layout.places:
-            return self._length_warning(message)  # a sound message, of other outputs
+            return self._length_warning(message)  # valid, but with other outputs
 
         out: list[Decoded] = []
         if not self._check.done:

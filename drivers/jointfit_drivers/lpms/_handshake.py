@@ -86,7 +86,7 @@ class LpmsHandshake:
         if not await self._conversation.enter_command_mode():
             await self._explain_silence()
         await self._ensure_generation()
-        await self._conversation.read(self._table.read_firmware)  # for the decoder
+        await self._conversation.read(self._table.read_firmware)  # the decoder needs the reply
         await self._ensure_configuration()
         await self._start()
 

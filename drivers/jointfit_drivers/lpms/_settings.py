@@ -70,7 +70,7 @@ class LpmsSettings(SerialImuSettings, LpmsConventionSettings):
     @override
     def contradictions(self) -> Iterator[tuple[str, str]]:
         """Yield rates that the generation does not support, or that its time cannot count."""
-        known: Any = (self.generation, self.rate_hz)  # None: cannot be read
+        known: Any = (self.generation, self.rate_hz)  # None: key cannot be read
         if None in known:
             return
         rates = self.table.rates_hz

@@ -32,7 +32,7 @@ def load_library() -> Any:
             "mocap.driver: lsl-markers needs the package pylsl: add it with pip install "
             "'jointfitd[lsl]'"
         ) from missing
-    except (RuntimeError, OSError) as missing:  # pylsl without its library
+    except (RuntimeError, OSError) as missing:  # pylsl is installed without liblsl
         raise DeviceMisconfiguredError(
             "mocap.driver: pylsl of lsl-markers finds no library liblsl, which its packages contain"
             " for x86-64 only: install liblsl (https://github.com/sccn/liblsl) and set PYLSL_LIB to"

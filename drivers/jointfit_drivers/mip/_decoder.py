@@ -136,7 +136,7 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
         self, packet: MipPacket, values: dict[int, tuple[Any, ...]]
     ) -> list[Decoded]:
         """Return the samples that the decoded fields of one packet contain."""
-        if not self._needed <= values.keys():  # fields with other decimations
+        if not self._needed <= values.keys():  # some fields have another decimation
             return []
 
         self._foreign = 0
@@ -160,7 +160,7 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
         out: list[Decoded] = []
         if status is not None:
             out = self._note_validity(arrival_ns, is_valid=bool(status & 1))
-            if not status & 1:  # only its time counts
+            if not status & 1:  # use only the time
                 return out + self._samples.add(TimedReading(packet.size, arrival_ns, ticks))
         q = canonical(native, "NED")
         reading = TimedReading(packet.size, arrival_ns, ticks, q, native, status)

@@ -97,7 +97,7 @@ class MipHandshake:
 
         try:
             await self._configure()
-        except DeviceMisconfiguredError:  # it streams as before
+        except DeviceMisconfiguredError:  # the device streams as before
             await self._conversation.command(CommandSet.BASE, Base.RESUME, tries=1)
             raise
         self._refuse(await self._answer(CommandSet.BASE, Base.RESUME), "refuses to resume")

@@ -182,7 +182,7 @@ def _columns(what: str, entries: Sequence[ModelEntry], wanted: Mapping[str, str]
             found.unknown.append(name)
             known = free_entries if len(problems) < _MOST_SUGGESTED else {}
             near = None if fitting else nearest_name(name, islice(known, _MOST_COMPARED))
-            free_entries.pop(near or "", None)  # two names in rig.toml are not one marker
+            free_entries.pop(near or "", None)  # never bind two names to one marker
             problem = "is not in the stream" + (f"; did you mean {near!r}?" if near else ".")
             if fitting:
                 choices = [repr(next(iter(e.aliases), e.name)) for e in fitting[:MOST_NAMED]]
@@ -197,7 +197,7 @@ def _columns(what: str, entries: Sequence[ModelEntry], wanted: Mapping[str, str]
             found.warnings.append(text)
             break
         free = None if entry.key in taken else _unused_name(entry, plain, used)
-        if free is not None:  # None: its id occurs twice, and frames with this id are refused
+        if free is not None:  # None: the id occurs twice, so frames with it are rejected
             found.names.append(free)
             found.keys.append(entry.key)
             used.add(free)

@@ -78,7 +78,7 @@ class OpenRequests:
             # Each stamp is accepted only once, because a duplicate with other ticks would distort
             # the clock.
             echo = decode(datagram, (0, 0))
-            accepted = True  # malformed: counted as corrupt by the decoder
+            accepted = True  # malformed; the decoder counts it as corrupt
             if isinstance(echo, EchoResponse):
                 known = echo.stamp in self._echoes
                 self._echoes.pop(echo.stamp, None)
@@ -87,7 +87,7 @@ class OpenRequests:
             asked_ns = self._asked_ns.pop(_REQUEST_OF_ANSWER[NatNetMessageId(kind)], None)
             accepted = asked_ns is not None and now_ns - asked_ns <= ANSWER_NS
         else:
-            accepted = True  # has no effect; corrupt bytes are counted
+            accepted = True  # no effect, but corrupt bytes are counted
 
         self.unsolicited += not accepted
         return accepted

@@ -137,7 +137,7 @@ class PoseConverter:
             if key not in binding.known:
                 unknown.append(key)
             elif key in met:
-                seen.pop(key, None)  # two bodies with one id cannot be distinguished
+                seen.pop(key, None)  # bodies with the same id are ambiguous
             elif params & BODY_TRACKED:
                 q = unit_quaternion(qw, qx, qy, qz)
                 if q is not None and is_near(x, y, z):

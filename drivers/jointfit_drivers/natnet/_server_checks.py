@@ -60,7 +60,7 @@ def check_server(name: str, settings: NatNetSettings, info: ServerInfo) -> None:
             f"{found}; {OLDEST[0]}.{OLDEST[1]} or newer is required: update Motive to 1.5 or later"
         )
     if info.bitstream < TICKED:
-        return  # frames without server ticks: no clock is needed
+        return  # frames have no server ticks, so no clock is needed
     if not info.clock_hz:
         raise DeviceMisconfiguredError(
             f"{found} but announces no clock frequency, so its stamps cannot be used: "

@@ -86,7 +86,7 @@ async def open_in_thread(key: str, name: str, make: Callable[[], _Bus]) -> _Bus:
         with suppress(TimeoutError):
             async with asyncio.timeout(OPEN_S):
                 await ended.wait()
-        if made.cancel():  # not open yet: the thread will close it
+        if made.cancel():  # not open yet; the thread will close it
             raise too_long
     except asyncio.CancelledError:
         if not made.cancel() and made.exception() is None:

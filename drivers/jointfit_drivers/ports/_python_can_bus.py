@@ -99,17 +99,17 @@ class PythonCanBus:
         self._bus = bus
         try:
             self._fd = bus.fileno()
-        except NotImplementedError:  # no descriptor: in-process buses, most vendors' libraries
+        except NotImplementedError:  # no descriptor: virtual buses and most vendor libraries
             self._pump = _Pump(
                 bus, self._convert_frame, deliver, lambda e: failed(self._receive_error(e))
             )
             return
 
-        if self._kernel:  # enlarge the receive buffer: a full queue drops frames without notice
+        if self._kernel:  # a full receive buffer drops frames without notice
             sock = _socket(bus)
             try:
                 sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BYTES)
-            except OSError:  # not privileged: the kernel cuts this one to net.core.rmem_max
+            except OSError:  # without privileges, net.core.rmem_max is the limit
                 sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
 
         loop, fd = asyncio.get_running_loop(), self._fd
@@ -118,7 +118,7 @@ class PythonCanBus:
             try:
                 self._drain(bus, deliver)
             except Exception as error:  # noqa: BLE001 - a loop callback's error would only be logged
-                loop.remove_reader(fd)  # reported once: reading on would wait without end
+                loop.remove_reader(fd)  # report once; the next read would block
                 failed(self._receive_error(error))
 
         loop.add_reader(fd, readable)
@@ -283,7 +283,7 @@ def _require_server(bus: can.BusABC) -> None:
     sock: socket.socket | None = getattr(bus, "_SocketCanDaemonBus__socket", None)
     try:
         closed = sock is not None and not sock.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
-    except OSError:  # nothing to read; other errors are those of the next message
+    except OSError:  # no data; the next read reports other errors
         return
     if closed:
         raise DeviceLostError(
@@ -296,7 +296,7 @@ def _require_interface(name: str) -> None:
     """Raise the OSError that binding a socket to `name` would raise."""
     socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     try:
-        socket.if_nametoindex(name)  # not if_nameindex: that asks netlink, which the unit refuses
+        socket.if_nametoindex(name)  # if_nameindex needs netlink, which the systemd unit forbids
     except OSError as error:  # CPython sets no error number here
         raise OSError(errno.ENODEV, "no such interface") from error
 

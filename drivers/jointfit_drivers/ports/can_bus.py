@@ -348,7 +348,7 @@ class SharedBus:
         self._failed = error
         for each in self._subscribers:
             if not each.ended.done():
-                lost = isinstance(error, DeviceLostError)  # one exception each
+                lost = isinstance(error, DeviceLostError)  # a separate exception for each device
                 each.ended.set_exception(type(error)(str(error)) if lost else error)
 
 

@@ -162,7 +162,7 @@ class SerialPort:
             The port was unplugged, or was silent for `silence_s`.
         """
         loop = asyncio.get_running_loop()
-        ended: asyncio.Future[None] = loop.create_future()  # with a result: silence
+        ended: asyncio.Future[None] = loop.create_future()  # a result means silence
 
         def end_silent() -> None:
             if not ended.done():
@@ -203,7 +203,7 @@ class SerialPort:
         arrived: asyncio.Future[Chunk] = loop.create_future()
 
         def take(chunk: Chunk) -> None:
-            loop.remove_reader(self._fd)  # one chunk; later bytes are for the next call
+            loop.remove_reader(self._fd)  # later bytes are for the next call
             if not arrived.done():
                 arrived.set_result(chunk)
 
@@ -289,7 +289,7 @@ def _device_error(
         kind = DeviceAbsentError if number in _ABSENT else DeviceLostError
         return kind(f"{path}: {found}{_remedy(path, number, key)}")
 
-    if isinstance(error, ValueError):  # pyserial: the driver of this port refused the speed
+    if isinstance(error, ValueError):  # pyserial raises it if the port refuses the speed
         return DeviceMisconfiguredError(
             f"{path}: cannot run at {baud} baud: set `baud` to a speed that port and device share"
         )

@@ -100,7 +100,7 @@ class TcpConnection:
             The connection is lost, or the server does not read.
         """
         sent = self._socket.send(data)
-        if sent != len(data):  # requests are short: a full buffer means that nobody reads it
+        if sent != len(data):  # a short request does not fit if the server does not read
             raise OSError(errno.ENOBUFS, "the server does not read its requests")
 
     def receive(self) -> ReceivedBytes | None:

@@ -104,7 +104,7 @@ class QtmPoseConverter:
             numbers[~(np.abs(numbers[:, :3]) <= FARTHEST_M).all(axis=1)] = np.nan
             placed = numbers[columns, :3] @ self._rotation
             residuals = numbers[columns, 3]
-            residuals[~(residuals > 0.0)] = np.nan  # positions computed without cameras have zero
+            residuals[~(residuals > 0.0)] = np.nan  # estimated positions have residual 0
         return QtmColumns(
             placed,
             rows_array([place for place, _ in rows], 3),

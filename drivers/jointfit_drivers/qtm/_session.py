@@ -131,7 +131,7 @@ class QtmSession:
     def _read_udp(self, udp: UdpSocket) -> None:
         try:
             arrivals = udp.receive()
-        except OSError:  # an ICMP refusal: nothing is sent from this socket
+        except OSError:  # an ICMP refusal is forged: this socket sends nothing
             return
         for arrival in arrivals:
             if arrival.host == self._route.host and _packet_type(arrival.data) in _DATA_TYPES:

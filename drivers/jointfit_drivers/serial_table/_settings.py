@@ -167,7 +167,7 @@ class SerialTableSettings(SerialImuSettings, TableImuSettings):
                 yield "text", "expected either `frame` or `text`: remove one"
             return
         if not _is_readable(self):
-            return  # reported; nothing can be placed
+            return  # already reported; no positions are known
         form = self.places()
         yield from form.faults
         if self.frame is not None:

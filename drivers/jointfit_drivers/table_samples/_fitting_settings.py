@@ -90,7 +90,7 @@ def _candidates(
         changes = {"type": f"{kind}{first.bits}"} if kind != first.kind else {}
         if order != first.byte_order:
             if any(field.bit or field.bits % 8 for field in fields):
-                continue  # another byte order has other places, too
+                continue  # another byte order changes the positions, too
             changes["byte_order"] = order
         yield (
             changes,

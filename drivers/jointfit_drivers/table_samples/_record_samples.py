@@ -64,7 +64,7 @@ class RecordSamples(Refusals):
         self._acceleration = self._places.get("acceleration")
         self._magnetic = self._places.get("magnetic")
         self._raw = self._new_filter()
-        self._raw_ns, self._raw_at = 0, -1  # time without wraps, ns, and the ticks there
+        self._raw_ns, self._raw_at = 0, -1  # time without wraps, ns, and its ticks
         self._limits = [_limits(form, slot) for slot in measured]
         self._scales = form.scales
         self._zeros = form.zeros if any(form.zeros) else None
@@ -158,7 +158,7 @@ class RecordSamples(Refusals):
         if q is None:
             if (
                 self.refused >= self._recheck and not self._is_reported
-            ):  # the first samples were good by chance
+            ):  # the first samples passed by chance
                 self._recheck *= 10
                 self._checks = PlausibilityChecks(form, self._places)
             return [self.refuse(record.size, "quaternion norm is not 1")]

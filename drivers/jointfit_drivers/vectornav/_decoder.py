@@ -118,7 +118,7 @@ class VectorNavDecoder(SerialMessageDecoder[VectorNavMessage]):
     @override
     def _take_corrupt(self, found: CorruptBytes) -> list[Decoded]:
         out = super()._take_corrupt(found)
-        if found.reason == UNKNOWN_HEADER:  # a repeated size is hardly noise
+        if found.reason == UNKNOWN_HEADER:  # noise rarely repeats a size
             content = f"binary outputs of {found.discarded} bytes with an unknown header"
             out += self._newer.take_unknown(content, self._stamps.chunk_ns)
         return out

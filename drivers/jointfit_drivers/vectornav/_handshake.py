@@ -98,7 +98,7 @@ class VectorNavHandshake:
 
         try:
             await self._configure()
-        except DeviceMisconfiguredError:  # it streams as before
+        except DeviceMisconfiguredError:  # the device streams as before
             await self._ask("VNASY,1", tries=1)
             raise
         self._refuse(await self._answer("VNASY,1"), "refuses to stream")
@@ -109,7 +109,7 @@ class VectorNavHandshake:
         if model.error is None and len(model.values) > 1:
             self._model = model.values[1]
         for register in (Register.SERIAL, Register.FIRMWARE, Register.ROTATION):
-            await self._answer(f"VNRRG,{register}")  # the decoder reports them
+            await self._answer(f"VNRRG,{register}")  # the decoder reports the replies
 
         changed = await self._ensure_output()
         changed |= await self._ensure_no_text()

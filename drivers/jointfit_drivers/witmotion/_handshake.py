@@ -105,7 +105,7 @@ class WitMotionHandshake:
         settings = self._settings
         settings.require_line_speed()
 
-        self._flush()  # system and bridge buffer a few kilobytes of an earlier run
+        self._flush()  # system and USB bridge buffer bytes of an earlier run
         found = await self._listen(_LISTEN_S, self._is_complete)
         if found.other_frames and not found.counts:
             raise DeviceMisconfiguredError(f"{self._path}: {OTHER_VARIANT}")
@@ -198,7 +198,7 @@ class WitMotionHandshake:
         ]
         await self._send(commands)
 
-        self._flush()  # frames of the settings before
+        self._flush()  # frames sent with the old settings
         found = await self._listen(_LISTEN_S, self._is_complete)
         missing = self._kinds - set(found.counts)
         if not found.received:

@@ -169,7 +169,7 @@ class XbusContinuity:
     def _classify(self, last: _OrientationPoint, held: _OrientationPoint) -> XbusStep:
         """Return the classification of two points that do not follow each other."""
         ticks, counts = self._ticks(last, held), _counts(last, held)
-        if ticks is None:  # counter only: it decreases at a restart only
+        if ticks is None:  # without time, only a restart decreases the counter
             fell = counts is not None and counts > _DISTINCT
             return XbusStep(restarted=True) if fell else XbusStep(_lost(last, held))
 
@@ -251,6 +251,6 @@ def _counts(last: _OrientationPoint, point: _OrientationPoint) -> int | None:
 def _lost(last: _OrientationPoint, point: _OrientationPoint) -> int:
     """Return the number of messages lost between two points."""
     counts = _counts(last, point)
-    if counts is None or counts > _DISTINCT:  # the counter went back by a few
+    if counts is None or counts > _DISTINCT:  # the counter decreased slightly
         return 0
     return max(counts - (point.messages - last.messages), 0)

@@ -133,7 +133,7 @@ class XbusDecoder:
         The product code or the first wrap of the device time determines the modulus.
         """
         modulus = self._continuity.modulus or setup.WRAP_32_BIT
-        if modulus != self._tick_clock.modulus:  # read after every chunk, and changes once
+        if modulus != self._tick_clock.modulus:  # read after every chunk, but changes only once
             self._tick_clock = TickClock(setup.TICK_NS, modulus)
         return self._tick_clock
 
@@ -335,12 +335,12 @@ class XbusDecoder:
         """Return the events of a message that is not a measurement."""
         mid, data = message.mid, message.data
         if mid == XbusMessageId.WAKE_UP:
-            if data:  # a WakeUp has no data: this is a corrupt measurement
+            if data:  # a WakeUp has no data, so this is a corrupt measurement
                 return []
             out = self._drop_held()
             self._continuity.forget()
             self._forget_orientation()
-            if self._measuring:  # it lost power, or was reset
+            if self._measuring:  # the device lost power or was reset
                 self._measuring = False
                 out.append(DeviceEvent("restart", "device restarted (WakeUp received)"))
             return out

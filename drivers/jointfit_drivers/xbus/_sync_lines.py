@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
-from typing_extensions import override  # typing has it from Python 3.12
+from typing_extensions import override  # typing contains it from Python 3.12
 
 from jointfit_daemon.driver import Settings
 from jointfit_protocols.xbus.configuration import SyncSetting
@@ -73,7 +73,7 @@ class XbusSyncSettings(Settings):
     @override
     def contradictions(self) -> Iterator[tuple[str, str]]:
         """Yield combinations of settings that no device supports."""
-        function: str | None = self.function  # None: cannot be read
+        function: str | None = self.function  # None: key cannot be read
         if function is None:
             return
         line: str | None = self.line

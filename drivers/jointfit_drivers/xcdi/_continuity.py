@@ -85,7 +85,7 @@ class XcdiContinuity:
         self._astray = 0
         self._contradictions: deque[bool] = deque(maxlen=_WINDOW)
         self._broken: deque[bool] = deque(maxlen=_WINDOW)
-        self._quiet = 0  # groups since a contradiction or a broken one
+        self._quiet = 0  # groups since a contradiction or broken group
         self.shared = False
 
     def group(
@@ -181,7 +181,7 @@ class _Track:
         self._ticks: int | None = None
         self._host: int | None = None  # arrival of the last group with time, ticks
         self._counter: int | None = None
-        self._groups = 0  # number of groups since the last one with time, according to the counter
+        self._groups = 0  # groups since the last group with time, by the counter
         self._uncounted = 0  # groups received, or known to be lost, since the last counter
         self._counted = False  # whether every group since then had a counter
         self._steps: list[float] = []
@@ -240,7 +240,7 @@ class _Track:
             return False
 
         step = self._step_to(later._ticks, later._host)
-        if step is None:  # the first groups: their delay is unknown
+        if step is None:  # the delay of the first groups is unknown
             advance = (later._ticks - self._ticks) % TICKS_MODULUS
             return advance <= _LATEST * self.period
 
@@ -283,7 +283,7 @@ class _Track:
                 lost = max(round(d / self.period) - 1, 0)
 
         if counter is None:
-            self._uncounted += 1 + lost  # its next step includes them
+            self._uncounted += 1 + lost  # the counter's next step includes them
         else:
             self._counter, self._uncounted = counter, 0
         if ticks is not None:

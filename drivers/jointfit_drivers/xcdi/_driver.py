@@ -115,7 +115,7 @@ class XcdiSettings(CanImuSettings):
     @override
     def contradictions(self) -> Iterator[tuple[str, str]]:
         """Yield 11-bit identifiers that are out of range."""
-        ids: Any = self.ids  # None: cannot be read
+        ids: Any = self.ids  # None: key cannot be read
         for name, number in ids or ():
             if number is not None and number > STANDARD_MAX and self.extended_ids is False:
                 yield (

@@ -99,7 +99,7 @@ class XImu3Continuity:
         self._last: XImu3Point | None = None
         self._before: XImu3Point | None = None
         self._held: XImu3Point | None = None
-        self._deviation = 0.0  # largest one of the last seconds, rad
+        self._deviation = 0.0  # largest deviation of the last seconds, rad
         self._dropped = 0  # messages dropped since the last accepted one
         self._shortest = 0
         self._sum_us = self._sum_periods = 0

@@ -107,7 +107,7 @@ class XImu3Decoder(SerialMessageDecoder[XImu3Data | XImu3Reply]):
         out = self._reports.reply_events(message)
         if message.key == "firmware_version" and message.error is None:
             out += self._newer.take_version(str(message.value)[:_LONGEST_VERSION])
-        if self._reports.world != world:  # orientations begin again
+        if self._reports.world != world:  # the continuity of orientations restarts
             self._continuity.forget()
         return out
 

@@ -85,7 +85,7 @@ class XImu3RawOrientation:
         """Return the field at the time of an inertial message; None if there is no recent field."""
         if self._field is None or ticks - self._measured_ticks > _OLDEST_US:
             return None
-        if self._samples.readings_only:  # each measured field once, as it was measured
+        if self._samples.readings_only:  # return each measured field once, unchanged
             field, self._field = self._field, None
             return field
         self._field = turned_field(self._field, rate, (ticks - self._field_ticks) * 1e-6)

@@ -65,7 +65,7 @@ class XImu3Settings(GatewaySettings, SerialImuSettings):
     @override
     def contradictions(self) -> Iterator[tuple[str, str]]:
         """Yield rates that the device does not support, and keys that `passive` cannot check."""
-        rate_hz: float | None = self.rate_hz  # None: cannot be read
+        rate_hz: float | None = self.rate_hz  # None: key cannot be read
         passive: bool | None = self.passive
         if rate_hz is not None and passive is False and rate_divisor(rate_hz) is None:
             near = sorted({BASE_RATE_HZ / divisor for divisor in nearest_divisors(rate_hz)})

@@ -114,7 +114,7 @@ def _read_sensor(path: Path) -> _DotFile:
             f"{path}: no column {_TIME} in the first {_HEADER_LINES} lines: export the recording of"
             " the DOT sensor again, with its sample time"
         )
-    header = {}  # values before the column names, by name in small letters
+    header = {}  # values before the column names, by lower-case name
     for line in lines[:at]:
         name, mark, value = line.partition(":")
         if mark:

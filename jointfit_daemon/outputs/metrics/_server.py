@@ -143,7 +143,7 @@ def _server_of(host: str) -> type[WSGIServer]:
         @override
         def finish_request(self, request: Any, client_address: Any) -> None:
             """Answer one client, and end its connection at the time limit."""
-            limit = threading.Timer(_CLIENT_S, _end, (request,))  # also for one that sends slowly
+            limit = threading.Timer(_CLIENT_S, _end, (request,))  # also for slow clients
             limit.daemon = True
             limit.start()
             try:

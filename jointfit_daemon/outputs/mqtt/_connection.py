@@ -314,7 +314,7 @@ class MqttConnection:
         settings, will = self._settings, self._will
         context = None
         if settings.tls is not None:
-            try:  # in a thread: reading the system's certificates takes tens of milliseconds
+            try:  # in a thread, because reading the certificates takes tens of ms
                 context = await asyncio.to_thread(tls_context, settings.tls)
             except TlsFilesError as fault:
                 raise BrokerLostError(f"{self._address()}: [mqtt.tls]: {fault}") from fault

@@ -116,7 +116,7 @@ class PacketLimitSocket:
         """Read until the end of the header; return False if the peer closed the connection."""
         while (missing := _SHORTEST_HEADER - len(self._header)) > 0 or self._header[-1] & _MORE:
             if len(self._header) == _LONGEST_HEADER:
-                break  # malformed: paho reports it
+                break  # malformed header, which paho reports
             data: bytes = self._wrapped.recv(max(1, missing))
             if not data:
                 return False

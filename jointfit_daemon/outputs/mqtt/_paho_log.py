@@ -21,5 +21,5 @@ class PahoLog(logging.Logger):
         for value in record.args if isinstance(record.args, tuple) else ():
             if isinstance(value, OSError):
                 self.last = value
-        if record.exc_info:  # a callback of the daemon failed: a bug
+        if record.exc_info:  # a callback of the daemon failed, which is a bug
             logging.getLogger(__name__).handle(record)

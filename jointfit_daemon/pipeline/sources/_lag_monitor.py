@@ -367,7 +367,7 @@ def _orientations(
             absent = np.full((len(seen), 1, 3), np.nan)  # column -1: not part of the stream
             positions = np.concatenate((seen, absent), axis=1).take(columns, axis=1)
             parts.append(rigid_fit(cluster.template, positions)[0])
-        yield  # also after frames of `before`: the instants of the results depend on the steps
+        yield  # also for frames of `before`, because results depend on the steps
     return t_ns, np.concatenate(parts)
 
 

@@ -192,7 +192,7 @@ class SourceState:
         for item in decoded:
             if isinstance(item, _MEASUREMENTS):
                 stamped = self._stamp(item, tick_clock)
-                if clock.news:  # an event found from a sample precedes the sample
+                if clock.news:  # return events that a sample reveals before the sample
                     items += self._clock_events()
                 items.append(stamped)
                 continue

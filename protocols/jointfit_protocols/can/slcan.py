@@ -143,7 +143,7 @@ class SlcanCodec:
         """
         found: list[CanFrame | SlcanLine | CorruptBytes] = []
         *lines, rest = (self._pending + data).replace(b"\n", b"").split(b"\r")
-        before = len(self._pending)  # bytes that came with earlier calls
+        before = len(self._pending)  # bytes of earlier calls
         # from a line's start to the end of `data`
         after_ns = (before + len(data)) * self._character_ns or sum(map(self._on_bus_ns, lines))
 

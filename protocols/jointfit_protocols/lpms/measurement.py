@@ -24,42 +24,42 @@ _SECONDS = struct.Struct("<f")
 
 
 class LpmsMeasurement(NamedTuple):
-    """Content of one data packet, as sent."""
+    """Content of one data packet, with the values as sent."""
 
     tick: int
     values: tuple[float, ...]
-    """Values in the order of the packet; integers if `floats` is false."""
+    """Values in the order of the packet. They are integers if `floats` is false."""
     floats: bool
 
 
 class PacketLayout:
-    """Positions of the outputs in the data packets of one mask.
+    """Positions of the outputs in the data packets for one output mask.
 
     Parameters
     ----------
     table : CommandTable
-        Generation of the device.
+        Commands and outputs of the sensor generation.
     mask : int
-        Enabled outputs.
+        Mask of the enabled outputs.
     """
 
     def __init__(self, table: CommandTable, mask: int) -> None:
         self.places: dict[str, slice] = {}
-        """Positions of each output among the values, by its name."""
+        """Indices of the values of each output, by the name of the output."""
         count = 0
         for name, bit, values in table.outputs:
             if mask >> bit & 1:
                 self.places[name] = slice(count, count + values)
                 count += values
         self.values = count
-        """Number of values of a packet."""
+        """Number of values in a packet."""
         self._floats = struct.Struct(f"<I{count}f")
         self._shorts = struct.Struct(f"<I{count}h")
         self.sizes = (self._floats.size, self._shorts.size)
-        """Lengths of a packet with 32-bit and with 16-bit values, bytes."""
+        """Lengths of a packet with 32-bit values and with 16-bit values, bytes."""
 
     def decode(self, data: bytes) -> LpmsMeasurement | None:
-        """Return the content of a data packet; None if the length does not match these outputs."""
+        """Return the content of a data packet; None if its length does not match the outputs."""
         size = len(data)
         if size == self._floats.size:
             tick, *values = self._floats.unpack(data)
@@ -70,12 +70,12 @@ class PacketLayout:
         return None
 
     def encode(self, tick: int, values: Sequence[float], *, floats: bool) -> bytes:
-        """Return the data of a packet; integers are limited to 16 bits.
+        """Return the data of a packet. Integers are limited to 16 bits.
 
         Raises
         ------
         ValueError
-            The number of values does not match these outputs.
+            The number of values does not match the outputs.
         """
         if len(values) != self.values:
             raise ValueError(f"{len(values)} values: these outputs have {self.values}")
@@ -86,12 +86,12 @@ class PacketLayout:
 
 
 def seconds_of(tick: int) -> float:
-    """Return the device time of old firmware, which sends float32 seconds in place of ticks."""
+    """Return the device time of old firmware, which sends float32 seconds instead of ticks."""
     (seconds,) = _SECONDS.unpack(_TICK.pack(tick))
     return float(seconds)
 
 
 def tick_of(seconds: float) -> int:
-    """Return what old firmware sends for a device time in seconds."""
+    """Return the number that old firmware sends for a device time in seconds."""
     (tick,) = _TICK.unpack(_SECONDS.pack(seconds))
     return int(tick)

@@ -1,7 +1,7 @@
-"""One stream of the Lab Streaming Layer as chunks of an XDF file, in both directions.
+"""One stream of the Lab Streaming Layer (LSL) as chunks of an XDF file, in both directions.
 
-liblsl delivers samples, not bytes. The driver writes them as XDF chunks, so that a recording
-contains what the stream contained, and a replay decodes the same input.
+The library liblsl delivers samples, not bytes. The driver converts them to XDF chunks. A recording
+therefore contains the complete content of the stream, and a replay decodes the same input.
 """
 
 from jointfit_protocols.lsl._chunks import (

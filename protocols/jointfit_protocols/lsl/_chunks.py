@@ -1,12 +1,12 @@
-"""Chunks of one stream: bytes to messages, and messages to bytes.
+"""Conversion of the chunks of one LSL stream to messages, and of messages to chunks.
 
-A chunk is the number of length bytes (1, 4 or 8), the length in them, a 16-bit tag and content,
-little-endian (https://github.com/sccn/xdf/wiki/Specifications). Tag 2 is the description of the
-stream, tag 3 samples. XDF stores the result of a clock comparison without its uncertainty;
-`RoundTrip` has both and a tag of its own, which readers of XDF skip.
+A chunk consists of the number of length bytes (1, 4 or 8), the length, a 16-bit tag and the
+content, all little-endian (https://github.com/sccn/xdf/wiki/Specifications). Tag 2 is the
+description of the stream, and tag 3 contains samples. XDF stores the result of a clock comparison
+without its uncertainty. `RoundTrip` contains both and has a separate tag, which XDF readers skip.
 
-Invariant: one call of `LslCodec.feed` receives whole chunks, as a datagram. It never raises. A
-length or count that does not agree with the bytes discards the rest of the datagram.
+Invariant: each call of `LslCodec.feed` receives complete chunks, like a datagram. It never raises.
+If a length or count does not agree with the bytes, the rest of the datagram is discarded.
 """
 
 from __future__ import annotations
@@ -22,33 +22,33 @@ if TYPE_CHECKING:
 
 _HEADER, _SAMPLES, _ROUND_TRIP = 2, 3, 0x4A46
 _STREAM = 1
-"""Number of the only stream."""
+"""Number of the stream; there is only one."""
 _LENGTHS = {1: struct.Struct("<B"), 4: struct.Struct("<I"), 8: struct.Struct("<Q")}
 _START = struct.Struct("<HI")
-"""Tag, and number of the stream."""
+"""Format of the tag and the number of the stream."""
 _TRIP = struct.Struct("<qqd")
 _STAMPED = 8
-"""Marks a sample with a time stamp; its number of bytes."""
+"""Value that marks a sample with a time stamp, which is the number of bytes of the stamp."""
 
 
 class Samples(NamedTuple):
-    """Samples that were received together."""
+    """Samples that arrived together."""
 
     stamps_s: tuple[float, ...]
-    """Time stamps as sent, s, clock of the sender."""
+    """Time stamps as sent, s, on the clock of the sender."""
     values: tuple[tuple[float, ...], ...]
-    """One row of `StreamDescription.channel_count` numbers for each stamp."""
+    """One row of `StreamDescription.channel_count` numbers for each time stamp."""
 
 
 class RoundTrip(NamedTuple):
     """One comparison of the sender's clock with the clock of this host."""
 
     sent_ns: int
-    """Request, CLOCK_MONOTONIC, ns."""
+    """Time at which the request was sent, CLOCK_MONOTONIC ns."""
     received_ns: int
-    """Reply, CLOCK_MONOTONIC, ns."""
+    """Time at which the reply arrived, CLOCK_MONOTONIC ns."""
     remote_s: float
-    """Clock of the sender in the middle, s."""
+    """Time on the clock of the sender in the middle between request and reply, s."""
 
 
 LslMessage = StreamDescription | Samples | RoundTrip
@@ -60,21 +60,21 @@ class LslCodec:
     Attributes
     ----------
     description : StreamDescription or None
-        The latest description; without one, samples cannot be decoded.
+        Most recent description. Without a description, samples cannot be decoded.
     """
 
     def __init__(self) -> None:
         self.description: StreamDescription | None = None
         self._row: struct.Struct | None = None
         self.messages = 0
-        """Samples and other well-formed chunks so far."""
+        """Number of samples and other well-formed chunks so far."""
         self.discarded = 0
         """Number of bytes so far that belong to no chunk."""
         self.undescribed = 0
-        """Chunks with samples before a description so far."""
+        """Number of chunks with samples that arrived before a description."""
 
     def feed(self, data: bytes) -> list[LslMessage | CorruptBytes]:
-        """Return the messages of whole chunks."""
+        """Return the messages in complete chunks."""
         out: list[LslMessage | CorruptBytes] = []
         at = 0
         while at < len(data):
@@ -93,7 +93,7 @@ class LslCodec:
     def _discard(
         self, data: bytes, at: int, reason: str, out: list[LslMessage | CorruptBytes]
     ) -> list[LslMessage | CorruptBytes]:
-        """Return `out` with the corrupt rest of a datagram."""
+        """Return `out` with an additional item for the corrupt rest of a datagram."""
         self.discarded += len(data) - at
         out.append(CorruptBytes(len(data) - at, reason))
         return out
@@ -124,7 +124,7 @@ class LslCodec:
         start = begin + 1 + size
         if size not in _LENGTHS or start > end:
             return "samples without their number"
-        # Compared before anything is allocated.
+        # The count is checked before memory is allocated.
         count = _LENGTHS[size].unpack_from(data, begin + 1)[0]
         if count * self._row.size != end - start:
             return f"{count} samples in {end - start} bytes"
@@ -139,14 +139,14 @@ class LslCodec:
 
 
 def encode_description(xml: str) -> bytes:
-    """Return the chunk of a description."""
+    """Return a chunk that contains a description."""
     return _chunk(_HEADER, xml.encode("utf-8", "replace"))
 
 
 def encode_samples(
     channel_format: str, stamps_s: Sequence[float], values: Sequence[Sequence[float]]
 ) -> bytes:
-    """Return the chunk of samples.
+    """Return a chunk that contains samples.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def encode_samples(
     stamps_s : sequence of float
         Time stamps as sent, s.
     values : sequence of sequences of float
-        One row for each stamp.
+        One row for each time stamp.
     """
     row = struct.Struct(f"<Bd{len(values[0]) if values else 0}{FORMATS[channel_format]}")
     packed = (row.pack(_STAMPED, t, *one) for t, one in zip(stamps_s, values, strict=True))
@@ -163,12 +163,12 @@ def encode_samples(
 
 
 def encode_round_trip(trip: RoundTrip) -> bytes:
-    """Return the chunk of a clock comparison."""
+    """Return a chunk that contains a clock comparison."""
     return _chunk(_ROUND_TRIP, _TRIP.pack(*trip))
 
 
 def _content(data: bytes, at: int) -> tuple[int, int, int] | str:
-    """Return tag of the chunk at `at`, begin and end of its content; or why there is none."""
+    """Return tag, begin and end of the content of the chunk at `at`, or why there is no chunk."""
     size = data[at]
     start = at + 1 + size
     if size not in _LENGTHS or start + _START.size > len(data):

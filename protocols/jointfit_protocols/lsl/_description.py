@@ -1,4 +1,4 @@
-"""Description of a stream, as liblsl and XDF write it: XML with one element for each channel.
+"""Description of a stream as liblsl and XDF write it: XML with one element for each channel.
 
 Source: https://github.com/sccn/xdf/wiki/MoCap-Meta-Data.
 """
@@ -11,16 +11,16 @@ from xml.etree import ElementTree as ET
 FORMATS = {
     "float32": "f", "double64": "d", "int8": "b", "int16": "h", "int32": "i", "int64": "q",
 }  # fmt: skip
-"""Formats of numbers, and their codes in `struct`."""
+"""Number formats of the samples, and their codes in `struct`."""
 MOST_CHANNELS = 20_000
 """Largest accepted number of channels."""
 _LARGEST_XML = 8 << 20
-"""Longest accepted description, bytes."""
+"""Largest accepted description, bytes."""
 _FASTEST_HZ = 1e6
 
 
 class Channel(NamedTuple):
-    """Description of one channel; fields that are not described are empty."""
+    """Description of one channel. Fields that are not described are empty."""
 
     label: str = ""
     marker: str = ""
@@ -36,21 +36,21 @@ class StreamDescription(NamedTuple):
     type: str
     channel_count: int
     channel_format: str
-    """A key of `FORMATS`, ``string`` or another text."""
+    """Format of the samples: a key of `FORMATS`, ``string``, or an unknown text."""
     rate_hz: float
-    """Nominal rate, Hz; 0: irregular."""
+    """Nominal rate, Hz; 0 for an irregular stream."""
     source_id: str
     hostname: str
     channels: tuple[Channel, ...]
-    """Described channels: none, or `channel_count`."""
+    """Described channels. There are none or `channel_count`."""
     manufacturer: str
     model: str
     compensated_lag_s: float
-    """Delay of the device that the time stamps account for, s."""
+    """Delay of the device for which the time stamps are already corrected, s."""
 
 
 def parse_description(data: bytes) -> StreamDescription | str:
-    """Return the description in an XML document, or the reason why there is none."""
+    """Return the description in an XML document, or the reason why there is no valid one."""
     if len(data) > _LARGEST_XML:
         return "description too long"
     if b"<!" in data:  # entities could grow
@@ -87,7 +87,7 @@ def _text(root: ET.Element, path: str) -> str:
 
 
 def _number(root: ET.Element, path: str, largest: float) -> float:
-    """Return a number between 0 and `largest`; 0 if there is none."""
+    """Return the number at `path`, from 0 to `largest`; 0 if there is none."""
     try:
         value = float(_text(root, path) or 0.0)
     except ValueError:

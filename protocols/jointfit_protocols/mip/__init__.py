@@ -1,4 +1,4 @@
-"""MicroStrain MIP over UART or USB: framing, commands and data fields."""
+"""Wire format MIP of MicroStrain over UART or USB: framing, commands and data fields."""
 
 from jointfit_protocols.mip._framing import (
     MAX_PACKET,

@@ -4,13 +4,13 @@
     | 75 | 65 | desc.set | n | fields ...    | S1 | S2 |
     field: | length, with itself and the descriptor | descriptor | data |
 
-S1 is the sum of all bytes before the checksum, S2 the sum of all values of S1, both modulo 256.
-The fields end exactly at n. Numbers are big-endian. Descriptor sets below 0x80 are commands and
-their replies, the others are data.
+S1 is the sum of all bytes before the checksum, and S2 is the sum of all values of S1, both modulo
+256. The fields fill the n bytes exactly. Numbers are big-endian. Descriptor sets below 0x80 are
+commands and their replies. All other sets are data.
 
 Source: the packet documentation of the vendor's mip_sdk (MIT); checked on 8384 recorded packets.
 
-Invariant: bytes in, packets out; no port, no clock.
+Invariant: the codec converts bytes to packets. It uses no port and no clock.
 """
 
 from __future__ import annotations
@@ -39,24 +39,24 @@ MipField = tuple[int, bytes]
 
 
 class MipPacket(NamedTuple):
-    """One packet with a valid checksum."""
+    """One packet whose checksum is correct."""
 
     descriptor_set: int
     fields: tuple[MipField, ...]
     size: int
-    """Length on the wire, bytes."""
+    """Length of the packet on the wire, bytes."""
     end: int = 0
-    """Number of bytes fed to the decoder up to and including the checksum, for back-dating of the
+    """Number of bytes fed to the codec until the end of the checksum, for back-dating of the
     message."""
 
 
 def encode(descriptor_set: int, fields: Iterable[MipField]) -> bytes:
-    """Return the packet on the wire.
+    """Return the bytes of a packet on the wire.
 
     Raises
     ------
     ValueError
-        The fields are longer than 255 bytes.
+        The fields have more than 255 bytes.
     """
     payload = b"".join(
         bytes((len(data) + _FIELD_HEAD, descriptor)) + data for descriptor, data in fields
@@ -72,7 +72,7 @@ def _checksum(body: bytes) -> bytes:
 
 
 def split_fields(payload: bytes) -> tuple[MipField, ...] | None:
-    """Return the fields of a packet; None if they do not end exactly at its end."""
+    """Return the fields of a packet; None if they do not fill the packet exactly."""
     fields: list[MipField] = []
     at, end = 0, len(payload)
     while at < end:
@@ -86,7 +86,7 @@ def split_fields(payload: bytes) -> tuple[MipField, ...] | None:
 
 
 def _read_packet(buffer: bytes, at: int, base: int) -> MipPacket | CorruptBytes | None:
-    """Return the packet that begins at `at`, the reason why none does, or None if it is cut."""
+    """Return the packet at `at`, the reason why there is none, or None if it is incomplete."""
     end = len(buffer)
     if not buffer.startswith(SYNC, at):  # the last byte may be the first half of a start
         return None if at == end - 1 and buffer[at] == SYNC[0] else _NO_START
@@ -106,9 +106,9 @@ def _read_packet(buffer: bytes, at: int, base: int) -> MipPacket | CorruptBytes 
 
 
 class MipCodec(ResynchronizingCodec[MipPacket]):
-    """Decoder of pieces of any size to packets; the result does not depend on the pieces.
+    """Codec that converts byte strings of any size to packets; their boundaries do not matter.
 
-    Runs of corrupt bytes are reported at the latest every 261 bytes.
+    Runs of corrupt bytes are reported after at most 261 bytes.
     """
 
     def __init__(self) -> None:

@@ -1,10 +1,10 @@
 """MIP commands and replies that configure a device.
 
-A command packet has one field. Its reply has the field 0xF1, ``command | code``, and, for commands
-that read, a field with the values. Most commands begin with a function: 1 write, 2 read, 3 save,
-4 load, 5 default. Settings are volatile until saved.
+A command packet has one field. Its reply contains the field 0xF1, ``command | code``. Replies to
+commands that read also contain a field with the values. Most commands begin with a function: 1
+write, 2 read, 3 save, 4 load, 5 default. Settings are volatile until they are saved.
 
-Two families have different commands for the same settings:
+The two families of devices use different commands for the same settings:
 
 |           | current                       | legacy: IMU (0x80)       | legacy: filter (0x82)    |
 |-----------|-------------------------------|--------------------------|--------------------------|
@@ -12,7 +12,7 @@ Two families have different commands for the same settings:
 | format    | 0C,0F: fn, set, n, list -> 8F | 0C,08: fn, n, list -> 80 | 0C,0A: fn, n, list -> 82 |
 | stream    | 0C,11: fn, set, on -> 85      | selector 1               | selector 3               |
 
-An entry of a list is ``field U1 | decimation U2``.
+An entry of a list in the table is ``field U1 | decimation U2``.
 
 Source: definitions of the vendor's mip_sdk (MIT).
 """
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 Family = Literal["current", "legacy"]
 
 REPLY = 0xF1
-"""Field of every reply: command and code."""
+"""Descriptor of the field in every reply that contains command and code."""
 REPLY_BYTES = 2
-"""Size of its data, bytes."""
+"""Size of the data of this field, bytes."""
 OK, UNKNOWN_COMMAND = 0, 1
 CODES = {
     UNKNOWN_COMMAND: "unknown command",
@@ -47,7 +47,7 @@ CODES = {
 
 
 class CommandSet(IntEnum):
-    """Descriptor sets of commands."""
+    """Descriptor sets that contain commands."""
 
     BASE = 0x01
     SETUP = 0x0C
@@ -98,12 +98,12 @@ class FilterSetup(IntEnum):
     """Commands of the set 0x0D, and the data of their replies."""
 
     ROTATION = 0x11
-    """Sensor-to-vehicle rotation of the legacy family: roll, pitch, yaw, rad."""
+    """Sensor-to-vehicle rotation in the legacy family: roll, pitch, yaw, rad."""
     ROTATION_REPLY = 0x81
 
 
 class Function(IntEnum):
-    """First byte of a command that has a setting."""
+    """First byte of a command that concerns a setting."""
 
     WRITE = 1
     READ = 2
@@ -121,10 +121,10 @@ class FormatEntry(NamedTuple):
 
 
 class DeviceInformation(NamedTuple):
-    """Reply to 01,03."""
+    """Content of the reply to the command 01,03."""
 
     firmware: int
-    """Version times 1000: 1105 is 1.1.05."""
+    """Firmware version times 1000: 1105 means 1.1.05."""
     model_name: str
     model_number: str
     serial: str
@@ -138,20 +138,20 @@ class DeviceInformation(NamedTuple):
 
 
 class StreamCommands(NamedTuple):
-    """Commands of one family for one data set, all of the set 0x0C."""
+    """Commands of one device family for one data set; all belong to the set 0x0C."""
 
     base_rate: int
     base_rate_reply: int
     format: int
     format_reply: int
     prefix: bytes
-    """Bytes that name the data set in commands and replies of rate and format."""
+    """Bytes that identify the data set in commands and replies about rate and format."""
     selector: int
     """Number of the data set in the stream command."""
 
 
 def stream_commands(family: Family, descriptor_set: int) -> StreamCommands:
-    """Return the commands for the data set 0x80 or 0x82, or any set of the current family."""
+    """Return the commands for the data set 0x80 or 0x82; in the current family, for any set."""
     if family == "current":
         return StreamCommands(
             Setup.BASE_RATE,
@@ -186,7 +186,7 @@ _INFO = struct.Struct(">H16s16s16s16s16s")
 _OUTPUT = struct.Struct(">BH")
 _RATE = struct.Struct(">H")
 _MOST_OUTPUTS = 82
-"""Entries of a message format that fit in a packet."""
+"""Largest number of entries of a message format in one packet."""
 
 
 def encode_command(descriptor_set: int, command: int, data: bytes = b"") -> bytes:
@@ -195,7 +195,7 @@ def encode_command(descriptor_set: int, command: int, data: bytes = b"") -> byte
 
 
 def reply_code(packet: MipPacket, command: int) -> int | None:
-    """Return the code of the reply to `command` in a packet; None if it contains none."""
+    """Return the code in the reply to `command`; None if the packet contains no such reply."""
     for descriptor, data in packet.fields:
         if descriptor == REPLY and len(data) == REPLY_BYTES and data[0] == command:
             return data[1]
@@ -203,7 +203,7 @@ def reply_code(packet: MipPacket, command: int) -> int | None:
 
 
 def reply_data(packet: MipPacket, descriptor: int) -> bytes | None:
-    """Return the data of a field of a reply; None if it has none."""
+    """Return the data of a field in a reply; None if the reply does not contain the field."""
     return next((data for found, data in packet.fields if found == descriptor), None)
 
 
@@ -213,13 +213,13 @@ def code_text(code: int) -> str:
 
 
 def encode_info(info: DeviceInformation) -> bytes:
-    """Return the data of a device information."""
+    """Return the data of a reply with device information."""
     texts = (text.encode("ascii", "replace").ljust(16) for text in map(str, info[1:]))
     return _INFO.pack(info.firmware, *texts)
 
 
 def decode_info(data: bytes) -> DeviceInformation | None:
-    """Return a device information; None if `data` is not one."""
+    """Return the device information in `data`; None if it is malformed."""
     if len(data) != _INFO.size:
         return None
     firmware, *texts = _INFO.unpack(data)
@@ -240,13 +240,13 @@ def decode_descriptors(data: bytes) -> frozenset[int]:
 
 
 def encode_outputs(prefix: bytes, outputs: Iterable[tuple[int, int]]) -> bytes:
-    """Return the list of a message format, as in commands (after the function) and replies."""
+    """Return the list of a message format, as in replies and (after the function) commands."""
     entries = [_OUTPUT.pack(*output) for output in outputs]
     return prefix + bytes((len(entries),)) + b"".join(entries)
 
 
 def decode_outputs(prefix: bytes, data: bytes) -> tuple[FormatEntry, ...] | None:
-    """Return the entries of a message format; None if `data` is not one of this data set."""
+    """Return the entries of a message format; None if `data` do not belong to this data set."""
     head = len(prefix)
     if not data.startswith(prefix) or len(data) <= head:
         return None
@@ -257,22 +257,22 @@ def decode_outputs(prefix: bytes, data: bytes) -> tuple[FormatEntry, ...] | None
 
 
 def encode_rate(prefix: bytes, rate_hz: int) -> bytes:
-    """Return the data of a base rate."""
+    """Return the data of a reply with a base rate."""
     return prefix + _RATE.pack(rate_hz)
 
 
 def decode_rate(prefix: bytes, data: bytes) -> int | None:
-    """Return a base rate, Hz; None if `data` is not one of this data set."""
+    """Return a base rate, Hz; None if `data` do not belong to this data set."""
     if not data.startswith(prefix) or len(data) != len(prefix) + _RATE.size:
         return None
     return int.from_bytes(data[-_RATE.size :], "big")
 
 
 def encode_floats(*values: float) -> bytes:
-    """Return the data of a transform."""
+    """Return the data of a command or reply with a transform."""
     return struct.pack(f">{len(values)}f", *values)
 
 
 def decode_floats(data: bytes, count: int) -> tuple[float, ...] | None:
-    """Return the values of a transform: 4 of a quaternion, 3 of angles; None if it is another."""
+    """Return the values of a transform: 4 for a quaternion, 3 for angles; None for other sizes."""
     return struct.unpack(f">{count}f", data) if len(data) == 4 * count else None

@@ -1,4 +1,4 @@
-"""Fields of MIP data packets, in values as sent; no unit is converted.
+"""Fields of MIP data packets. Values are returned as sent, without conversion of units.
 
 | set, field  | values                                                                        |
 |-------------|-------------------------------------------------------------------------------|
@@ -18,7 +18,8 @@
 | 0x82, 0x10  | filter state, dynamics mode, flags                                            |
 | 0x82, 0x11  | as 0x80, 0x12                                                                 |
 
-The quaternion maps vehicle to NED coordinates; vehicle equals sensor unless a transform is stored.
+The quaternion converts vehicle to NED coordinates. The vehicle frame equals the sensor frame unless
+a transform is stored in the device.
 
 Source: definitions of the vendor's mip_sdk (MIT).
 """
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 
 
 class DataSet(IntEnum):
-    """Descriptor sets of data."""
+    """Descriptor sets that contain data."""
 
     SENSOR = 0x80
     FILTER = 0x82
@@ -42,7 +43,7 @@ class DataSet(IntEnum):
 
 
 class SharedField(IntEnum):
-    """Fields of every data set."""
+    """Fields that every data set may contain."""
 
     EVENT_SOURCE = 0xD0
     GPS_TIME = 0xD3
@@ -52,7 +53,7 @@ class SharedField(IntEnum):
 
 
 class SensorField(IntEnum):
-    """Fields of the set 0x80."""
+    """Fields of the data set 0x80."""
 
     ACCELERATION = 0x04
     ANGULAR_RATE = 0x05
@@ -63,7 +64,7 @@ class SensorField(IntEnum):
 
 
 class FilterField(IntEnum):
-    """Fields of the set 0x82."""
+    """Fields of the data set 0x82."""
 
     QUATERNION = 0x03
     EULER_ANGLES = 0x05
@@ -74,7 +75,7 @@ class FilterField(IntEnum):
 WEEK_NS = 7 * 86_400 * 1_000_000_000
 """Duration of a GPS week, ns."""
 _MOST_SECONDS = 1e9
-"""Upper limit of a plausible time of week, s: without GPS it is the time since start."""
+"""Upper limit of a plausible time of week, s. Without GPS, it is the time since the start."""
 STANDARD_GRAVITY = 9.80665
 """One g of the accelerometer, m/s^2."""
 
@@ -118,7 +119,7 @@ _KNOWN_SETS = frozenset((0x80, 0x81, 0x82, 0x90, 0x91, 0x92, 0x93, 0x94, 0x95, 0
 def known_fields(descriptor_set: int) -> frozenset[int] | None:
     """Return the documented fields of a data set; None if the set itself is not documented.
 
-    Fields of sets without orientations are not listed: each of these fields counts as documented.
+    The fields of sets without orientations are not listed, so all of them count as documented.
     """
     if descriptor_set not in _KNOWN_SETS:
         return None
@@ -142,7 +143,7 @@ def encode_field(descriptor_set: int, descriptor: int, *values: float) -> MipFie
     KeyError
         The field is unknown.
     struct.error
-        The values do not fit.
+        The values do not fit the field.
     """
     layout = _LAYOUTS.get(descriptor_set, _SHARED)[descriptor]
     return descriptor, layout.pack(*values)
@@ -154,7 +155,7 @@ def field_bytes(descriptor_set: int, descriptor: int) -> int:
 
 
 def gps_ns(week: int, time_of_week_s: float) -> int | None:
-    """Return GPS time as one number, ns; None if the time of week is not finite."""
+    """Return GPS time as a single number, ns; None if the time of week is not finite."""
     if not 0.0 <= time_of_week_s < _MOST_SECONDS:  # NaN compares false
         return None
     return week * WEEK_NS + round(time_of_week_s * 1e9)

@@ -1,14 +1,14 @@
-"""The five forms of NatNet CONNECT (and DISCOVERY).
+"""The five forms of the NatNet message CONNECT, which DISCOVERY also uses.
 
 | bytes | content | sent by |
 |---|---|---|
 | 0 | nothing | libmotioncapture |
 | 5 | ``Ping`` NUL | PyPI natnet |
 | 264 | name[256], application version[4], NatNet version[4] | NatNetLib 3 |
-| 269 | the 264 above, subscribed data only, requested bitstream[4] | ``sConnectionOptions`` |
+| 269 | the 264 bytes above, subscribed data only, requested bitstream[4] | ``sConnectionOptions`` |
 | 271 | ``Ping``, zeros to 264, then the five bytes of the 269 form, zeros | NaturalPoint's sample |
 
-Source: NatNetTypes.h 4.1; a capture of NatNetLib 3; the clients named above.
+Source: NatNetTypes.h 4.1; a capture of NatNetLib 3; the clients in the table.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Version4 = tuple[int, int, int, int]
 
 
 class Connect(NamedTuple):
-    """A client's request to connect; ``form`` is the length of its payload, bytes."""
+    """Request of a client to connect. ``form`` is the length of its payload, bytes."""
 
     form: int = _FULL.size
     name: str = ""
@@ -36,11 +36,11 @@ class Connect(NamedTuple):
     natnet_version: Version4 = _NONE
     subscribed_only: bool = False
     bitstream: Version4 = _NONE
-    """Bitstream requested from a unicast 4.x server; zeros leave it to the server."""
+    """Bitstream requested from a unicast 4.x server. Zeros let the server choose the bitstream."""
 
 
 def decode_connect(data: bytes) -> Connect | None:
-    """Return the request in a CONNECT or DISCOVERY payload; None if it has none of the forms."""
+    """Return the request in a payload of CONNECT or DISCOVERY; None if it has an unknown form."""
     size = len(data)
     if size == 0:
         return Connect(0)
@@ -59,12 +59,12 @@ def decode_connect(data: bytes) -> Connect | None:
 
 
 def encode_connect(connect: Connect) -> bytes:
-    """Return the payload of a request in its own form.
+    """Return the payload of a request in the form that the request has.
 
     Raises
     ------
     ValueError
-        No form has that length, or the name is too long.
+        No form has this length, or the name is too long.
     """
     if connect.form == 0:
         return b""

@@ -1,10 +1,10 @@
 """A bounded reading position in one NatNet payload.
 
-Data that contradict the layout raise `MalformedError` (or `struct.error`, with the same
-meaning). The codec's outer functions convert both to `CorruptBytes`, so neither leaves the
+Data that contradict the layout raise `MalformedError`, or `struct.error` with the same meaning. The
+outer functions of the codec convert both to `CorruptBytes`, so neither exception leaves the
 package.
 
-Invariant: no read passes the end, and a count is used only if the remaining bytes suffice for it.
+Invariant: no read goes beyond the end. A count is used only if enough bytes remain for it.
 """
 
 from __future__ import annotations
@@ -16,26 +16,26 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 MAX_NAME = 255
-"""Longest accepted name, bytes; real ones are below 64."""
+"""Longest accepted name, bytes. Names of real servers have less than 64 bytes."""
 
 I32 = struct.Struct("<i")
 XYZ = struct.Struct("<3f")
 
 BREAKS = (ValueError, struct.error)
-"""Exceptions of reading a hostile payload (`MalformedError` is a ValueError)."""
+"""Exceptions that reading a malformed payload may raise (`MalformedError` is a ValueError)."""
 
 
 class MalformedError(ValueError):
-    """The payload contradicts the layout of its version."""
+    """The payload contradicts the layout of its bitstream version."""
 
 
 class Cursor:
-    """A reading position that advances from ``at`` to ``end`` of ``data``.
+    """A reading position in ``data``, which advances from ``at`` to ``end``.
 
     Parameters
     ----------
     data : bytes
-        The whole datagram.
+        The complete datagram.
     at : int
         Offset of the first payload byte.
     """
@@ -49,7 +49,7 @@ class Cursor:
 
     @property
     def left(self) -> int:
-        """Remaining bytes."""
+        """Number of remaining bytes."""
         return self.end - self.at
 
     def unpack(self, layout: struct.Struct) -> tuple[Any, ...]:
@@ -67,18 +67,18 @@ class Cursor:
         return value
 
     def count(self, smallest: int) -> int:
-        """Read a count of items of at least `smallest` bytes, bounded by the rest."""
+        """Read the number of items with at least `smallest` bytes each, and check it."""
         n = self.integer()
         self.check(n, smallest)
         return n
 
     def check(self, n: int, smallest: int) -> None:
-        """Refuse a count that is negative or that the remaining bytes cannot hold."""
+        """Reject a count that is negative or for which not enough bytes remain."""
         if n < 0 or n * smallest > self.end - self.at:
             raise MalformedError("a count exceeds the datagram")
 
     def records(self, layout: struct.Struct, n: int) -> list[tuple[Any, ...]]:
-        """Read `n` records of `layout`; `n` is checked here."""
+        """Check `n`, and read `n` records of `layout`."""
         if not n:
             return []
         self.check(n, layout.size)
@@ -87,7 +87,7 @@ class Cursor:
         return list(layout.iter_unpack(self.data[at : self.at]))
 
     def text(self) -> str:
-        """Read a NUL-terminated name: at most 255 bytes, UTF-8 with replacement."""
+        """Read a NUL-terminated name of at most 255 bytes; invalid UTF-8 is replaced."""
         stop = self.data.find(0, self.at, min(self.end, self.at + MAX_NAME + 1))
         if stop < 0:
             raise MalformedError("a name without an end")
@@ -101,10 +101,10 @@ class Cursor:
         return tuple(self.text() for _ in range(self.count(1)))
 
     def window(self, size: int, read: Callable[[], Any]) -> Any:
-        """Call `read` with the end `size` bytes from here, and continue behind it in any case.
+        """Call `read` for the next `size` bytes, and continue after these bytes in any case.
 
-        Returns None if `read` failed or left bytes: an unknown or malformed section is skipped
-        by its size. A size that the payload cannot hold raises `MalformedError`.
+        Return None if `read` failed or did not use all bytes. An unknown or malformed section is
+        skipped in this way. If fewer than `size` bytes remain, raise `MalformedError`.
         """
         if size < 0 or size > self.left:
             raise MalformedError("a section exceeds the datagram")
@@ -135,7 +135,7 @@ def put_text(name: str) -> bytes:
 
 
 def put_texts(names: tuple[str, ...]) -> bytes:
-    """Return a count and that many NUL-terminated names."""
+    """Return the number of names, followed by the NUL-terminated names."""
     return I32.pack(len(names)) + b"".join(map(put_text, names))
 
 
@@ -154,5 +154,8 @@ def put_fixed_text(name: str, size: int) -> bytes:
 
 
 def fixed_text(field: bytes) -> str:
-    """Return the name in a fixed field, up to the first NUL; stale memory may follow it."""
+    """Return the name in a field of fixed size, up to the first NUL.
+
+    Old data may follow the NUL.
+    """
     return field.partition(b"\0")[0].decode("utf-8", "replace")

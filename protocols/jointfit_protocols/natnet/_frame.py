@@ -1,10 +1,11 @@
-"""NatNet FRAMEOFDATA, bitstreams 3.0 to 4.x, as sent: without conversion of units or names.
+"""NatNet FRAMEOFDATA in bitstreams 3.0 to 4.x, without conversion of units or names.
 
     number | marker sets | other markers | bodies | skeletons | assets | labeled | plates | devices
     timecode | sub-frame | timestamp | exposure | received | transmit | [precision] | params | 0
 
-Little-endian, packed. Each section starts with ``i32 n`` and, from 4.1, ``i32 bytes`` of its items;
-assets exist from 4.1 on. Positions are metres in the server's world, quaternions x, y, z, w.
+Numbers are little-endian and packed. Each section starts with the number of its items (``i32 n``).
+From bitstream 4.1 on, the size of the items follows (``i32 bytes``), and there are assets.
+Positions are in metres in the server's world, and quaternions have the order x, y, z, w.
 
 Source: NaturalPoint NatNet SDK 4.1, NatNetTypes.h and PythonClient.
 """
@@ -18,16 +19,16 @@ from typing import Any, NamedTuple
 from jointfit_protocols.natnet._cursor import XYZ, Cursor, MalformedError
 
 Version = tuple[int, int]
-"""Bitstream in use: major and minor."""
+"""Bitstream version in use: major and minor number."""
 
 Position = tuple[float, float, float]
 
 SectionReader = Callable[[Cursor, int], tuple[Any, ...]]
-"""Function that reads the items of one section; its second argument is the number of items."""
+"""Function that reads the items of one section. Its second argument is the number of items."""
 
 OLDEST: Version = (2, 5)
 TICKED: Version = (3, 0)
-"""First bitstream whose frames contain server ticks; older frames are read by `_frame_2x`."""
+"""First bitstream whose frames contain server ticks. `_frame_2x` reads older frames."""
 SIZED: Version = (4, 1)
 """First bitstream whose sections contain their size in bytes."""
 
@@ -51,7 +52,7 @@ _LONG_TAIL = PRECISION_LAYOUT.size + END_LAYOUT.size
 
 
 class Body(NamedTuple):
-    """Pose of one rigid body or bone (38 bytes); a bone's id is ``skeleton << 16 | bone``."""
+    """Pose of one rigid body or bone (38 bytes). The id of a bone is ``skeleton << 16 | bone``."""
 
     id: int
     x: float
@@ -62,13 +63,17 @@ class Body(NamedTuple):
     qz: float
     qw: float
     error: float
-    """Mean marker error, m. Not a measure of validity: three markers always fit."""
+    """Mean marker error, m. It does not show whether the pose is valid: three markers always
+    fit."""
     params: int
-    """Bit 0 tracked; clear if the last valid pose is repeated."""
+    """Flags. Bit 0 means tracked; if it is clear, the last valid pose is repeated."""
 
 
 class LabeledMarker(NamedTuple):
-    """One labeled marker (26 bytes); id is ``model << 16 | member``, model 0 without a model."""
+    """One labeled marker (26 bytes).
+
+    Its id is ``model << 16 | member``, with model 0 for no model.
+    """
 
     id: int
     x: float
@@ -76,27 +81,27 @@ class LabeledMarker(NamedTuple):
     z: float
     size: float
     params: int
-    """``MARKER_`` bits; usable if not occluded and point-cloud solved."""
+    """Flags ``MARKER_``. A usable marker is not occluded and is point-cloud solved."""
     residual: float
-    """Marker residual, metres per camera ray."""
+    """Residual of the marker, metres per camera ray."""
 
 
 class MarkerSet(NamedTuple):
-    """Positions of one marker set, in the order of its description; (0, 0, 0) is missing."""
+    """Positions of one marker set, in the order of its description. (0, 0, 0) means missing."""
 
     name: str
     positions: tuple[Position, ...]
 
 
 class Skeleton(NamedTuple):
-    """One skeleton and its bones."""
+    """One skeleton with its bones."""
 
     id: int
     bones: tuple[Body, ...]
 
 
 class Asset(NamedTuple):
-    """One trained marker set (from 4.1)."""
+    """One trained marker set (bitstream 4.1 and later)."""
 
     id: int
     bodies: tuple[Body, ...]
@@ -104,20 +109,20 @@ class Asset(NamedTuple):
 
 
 class Analog(NamedTuple):
-    """Samples of one force plate or analog device, a tuple per channel."""
+    """Samples of one force plate or analog device, with a tuple for each channel."""
 
     id: int
     channels: tuple[tuple[float, ...], ...]
 
 
 class FrameOfData(NamedTuple):
-    """One camera frame with the values as sent."""
+    """One camera frame, with the values as sent."""
 
     number: int
     timestamp: float
-    """Frame number times nominal period, s; not a clock."""
+    """Frame number times the nominal period, s. It is not a clock."""
     exposure: int
-    """Center of the camera exposure, server ticks; 0 from USB cameras."""
+    """Center of the camera exposure, server ticks; 0 for USB cameras."""
     received: int
     transmit: int
     params: int = 0
@@ -134,16 +139,16 @@ class FrameOfData(NamedTuple):
     precision: tuple[int, int] | None = None
     """Seconds and fraction of an external clock; None if the bitstream has no such field."""
     skipped: tuple[str, ...] = ()
-    """Sections skipped by their size because their content is unknown."""
+    """Names of sections that were skipped by their size because their content is unknown."""
 
 
 def supported(version: Version) -> bool:
-    """Return whether frames of this bitstream can be decoded: 2.5 and newer, by section size."""
+    """Return whether frames of this bitstream can be decoded, which are those of 2.5 and newer."""
     return version >= OLDEST
 
 
 def read_frame(cursor: Cursor, sized: bool) -> FrameOfData:
-    """Read one frame; the length decides whether there is a precision timestamp."""
+    """Read one frame. The remaining length shows whether it contains a precision timestamp."""
     number = cursor.integer()
     skipped: list[str] = []
     sections = {
@@ -152,7 +157,7 @@ def read_frame(cursor: Cursor, sized: bool) -> FrameOfData:
     }
 
     tail = STAMPS_LAYOUT.size + _LONG_TAIL
-    while sized and cursor.left > tail:  # a section of a newer bitstream behind the known ones
+    while sized and cursor.left > tail:  # a newer bitstream has further sections
         _, size = cursor.unpack(TWO_LAYOUT)
         cursor.window(size, lambda: None)
         skipped.append("unknown")
@@ -179,7 +184,10 @@ def _read_section(
     read: SectionReader,
     skipped: list[str] | None,
 ) -> tuple[Any, ...]:
-    """Read one section; if `skipped` is given, skip a section that does not fit its stated size."""
+    """Read one section.
+
+    If `skipped` is given, skip a section that does not have its stated size.
+    """
     n = cursor.integer()
     if skipped is None:
         cursor.check(n, smallest)
@@ -215,16 +223,16 @@ def _read_analog(cursor: Cursor) -> Analog:
 
 
 def read_analogs(cursor: Cursor, n: int) -> tuple[Analog, ...]:
-    """Read `n` force plates or devices."""
+    """Read `n` force plates or analog devices."""
     return tuple(_read_analog(cursor) for _ in range(n))
 
 
 def _items(read: Callable[[Cursor], Any]) -> SectionReader:
-    """Return the reader of a section whose items differ in size."""
+    """Return the reader of a section whose items have different sizes."""
     return lambda cursor, n: tuple(read(cursor) for _ in range(n))
 
 
-# Name, smallest item (bytes), and reader of each section, in wire order.
+# Name, smallest item (bytes), and reader of each section, in the order on the wire.
 _SECTIONS: tuple[tuple[str, int, SectionReader], ...] = (
     ("marker_sets", 5, _items(lambda c: MarkerSet(c.text(), tuple(c.records(XYZ, c.integer()))))),
     ("other_markers", XYZ.size, lambda cursor, n: tuple(cursor.records(XYZ, n))),

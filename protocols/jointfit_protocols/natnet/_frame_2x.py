@@ -1,20 +1,20 @@
-"""NatNet FRAMEOFDATA of bitstreams 2.5 to 2.x, in both directions.
+"""NatNet FRAMEOFDATA in bitstreams 2.5 to 2.x, in both directions.
 
     number | marker sets | other markers | bodies | skeletons | labeled | [plates] | [devices]
     latency | timecode | sub-frame | [timestamp] | [params] | 0
 
-| from | part |
+| from version | content |
 |---|---|
 | all | a body has ``i32 n``, n positions, n ids and n sizes of its markers before its mean error |
 | 2.6 | i16 params of bodies, labeled markers and frame; timestamp as f32, from 2.7 as f64 |
 | 2.9, 2.11 | force plates, devices |
 
-There are no server ticks. Before 2.6 nothing marks a body that is not tracked: one at the origin
-without an orientation counts as such.
+There are no server ticks. Before version 2.6, no flag marks a body that is not tracked. A body at
+the origin without an orientation counts as not tracked.
 
 Source: NaturalPoint NatNet SDK 4.1, PythonClient.
 
-Invariant: `decode` inverts `encode`, except for markers inside bodies, which are not returned.
+Invariant: `decode` inverts `encode`, except for the markers inside bodies, which are not returned.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from jointfit_protocols.natnet._frame import Analog
 
 FLAGGED: Version = (2, 6)
-"""First bitstream with params."""
+"""First bitstream whose frames contain params."""
 _LONG_TIMESTAMP: Version = (2, 7)
 _PLATES: Version = (2, 9)
 _DEVICES: Version = (2, 11)
@@ -56,7 +56,7 @@ _FLOAT, _DOUBLE = struct.Struct("<f"), struct.Struct("<d")
 
 
 def read_frame_2x(cursor: Cursor, version: Version) -> FrameOfData:
-    """Read one frame; like all readers, raise one of the exceptions in `BREAKS`."""
+    """Read one frame. Like all readers, it raises only the exceptions in `BREAKS`."""
     number = cursor.integer()
     n = cursor.count(5)
     sets = tuple(
@@ -88,7 +88,7 @@ def read_frame_2x(cursor: Cursor, version: Version) -> FrameOfData:
 def put_frame_2x(
     frame: FrameOfData, version: Version, put_analog: Callable[[Analog], bytes]
 ) -> bytes:
-    """Return the payload of a frame; server ticks and residuals are left out."""
+    """Return the payload of a frame without server ticks and residuals."""
     sections: list[list[bytes]] = [
         [put_text(one.name) + _put_rows(one.positions) for one in frame.marker_sets],
         [XYZ.pack(*position) for position in frame.other_markers],
@@ -110,7 +110,7 @@ def put_frame_2x(
     for items in sections:
         parts += [I32.pack(len(items)), *items]
 
-    # Real servers write the time stamp in place of the latency.
+    # Real servers write the time stamp instead of the latency.
     parts.append(_CLOCK.pack(frame.timestamp, frame.timecode, frame.subframe))
     if version >= FLAGGED:
         parts.append((_DOUBLE if version >= _LONG_TIMESTAMP else _FLOAT).pack(frame.timestamp))

@@ -1,6 +1,6 @@
 """Decoder of NatNet FRAMEOFDATA in every supported bitstream.
 
-Invariant: a frame is accepted only if it ends exactly at the end of the datagram, end tag included.
+Invariant: a frame is accepted only if its end tag is exactly at the end of the datagram.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def decode_frame(datagram: bytes, version: Version) -> FrameOfData | CorruptBytes:
-    """Return the frame in a whole FRAMEOFDATA datagram (header included); never raises."""
+    """Return the frame in a complete FRAMEOFDATA datagram, including its header; never raise."""
     if not supported(version):
         return CorruptBytes(
             len(datagram), f"NatNet bitstream {version[0]}.{version[1]} is not supported"

@@ -1,6 +1,6 @@
 """Encoder of NatNet FRAMEOFDATA, for simulators and tests.
 
-Invariant: a frame of a real server that `decode_frame` has decoded is encoded byte for byte.
+Invariant: encoding a frame that `decode_frame` decoded returns the bytes of the real server.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ if TYPE_CHECKING:
 
 
 def encode_frame(frame: FrameOfData, version: Version) -> bytes:
-    """Return the payload (without message header) of `frame` in bitstream `version`.
+    """Return the payload of `frame` in bitstream `version`, without the message header.
 
     Raises
     ------
     ValueError
-        The bitstream is older than 2.5, or has no field for something in the frame.
+        The bitstream is older than 2.5, or has no field for some content of the frame.
     struct.error
-        A value exceeds its field.
+        A value is out of the range of its field.
     """
     if not supported(version):
         raise ValueError(f"bitstream {version[0]}.{version[1]} is not written")

@@ -1,10 +1,11 @@
 """Fast decoding of frames with the same bodies, markers and marker sets as an earlier frame.
 
-A server repeats its model in every frame: the counts and names of one frame give the place of every
-number in the next one. A frame with any other count or name has another layout.
+A server repeats its model in every frame. The counts and names in one frame therefore determine the
+position of every number in the next frame. A frame with a different count or name has a different
+layout.
 
-Invariant: the result equals the result of `decode_frame`, or is None. A layout for selected marker
-sets leaves out the other sets and the unlabeled markers.
+Invariant: the result equals the result of `decode_frame`, or is None. If marker sets are selected,
+the result contains neither the other sets nor the unlabeled markers.
 """
 
 from __future__ import annotations
@@ -36,20 +37,21 @@ if TYPE_CHECKING:
 _HEADER_BYTES = 4
 _body: Callable[[Iterable[object]], Body] = partial(tuple.__new__, Body)
 _marker: Callable[[Iterable[object]], LabeledMarker] = partial(tuple.__new__, LabeledMarker)
-"""Named tuples from unpacked records: a third of the time of ``_make``, which checks the length."""
+"""Constructor of a named tuple from an unpacked record. It takes a third of the time of ``_make``,
+which checks the length."""
 
 
 _Span = tuple[int, int]
-"""First byte of a section, and the byte behind it."""
+"""First byte of a section, and first byte after it."""
 
 
 class _FramePlaces(NamedTuple):
-    """Places of the numbers of a frame."""
+    """Positions of the numbers in a frame."""
 
     sets: tuple[tuple[str, _Span], ...]
-    """Marker sets that are read."""
+    """Marker sets that are read, each with its position."""
     unread: tuple[_Span, ...]
-    """Positions of the other marker sets."""
+    """Positions of the marker sets that are not read."""
     others: _Span
     all_read: bool
     """Whether all marker sets and the unlabeled markers are read."""
@@ -61,12 +63,12 @@ class _FramePlaces(NamedTuple):
 
 
 class FrameLayout:
-    """Places of the numbers in a frame, and all its other bytes.
+    """Positions of the numbers in a frame, and all other bytes of the frame.
 
     Parameters
     ----------
     places : _FramePlaces
-        Numbers that change from frame to frame.
+        Positions of the numbers that change from frame to frame.
     example : bytes
         Datagram of the first frame.
     """
@@ -83,7 +85,7 @@ class FrameLayout:
         for start, stop in (*changing, places.markers, tail):
             fixed[start:stop] = bytes(stop - start)
 
-        # One comparison of long integers checks all counts and names.
+        # A single comparison of long integers checks all counts and names.
         self._mask = int.from_bytes(fixed, "little")
         self._fixed = int.from_bytes(example, "little") & self._mask
 
@@ -94,15 +96,15 @@ class FrameLayout:
         version: Version,
         selected: frozenset[str] | None = None,
     ) -> FrameLayout | None:
-        """Return the layout of a decoded frame; None if it contains items without fixed places.
+        """Return the layout of a decoded frame; None if it contains items without fixed positions.
 
         Parameters
         ----------
         datagram, frame, version
-            The frame as received and as decoded, and its bitstream.
+            The frame as received, the decoded frame, and its bitstream version.
         selected : frozenset of str, optional
-            Names of the marker sets that are read; by default everything is read. A server repeats
-            each marker in two sets, which takes as long as the rest of a frame.
+            Names of the marker sets to read. By default everything is read. A server repeats each
+            marker in two sets, and reading both takes as long as the rest of a frame.
         """
         if frame.skeletons or frame.assets or frame.force_plates or frame.devices or frame.skipped:
             return None
@@ -122,7 +124,7 @@ class FrameLayout:
                 unread.append(span)
         others = _span(at + head, XYZ.size * len(frame.other_markers))
         bodies = _span(others[1] + head, BODY_LAYOUT.size * len(frame.bodies))
-        absent = 2 if version >= SIZED else 1  # skeletons, and assets where they exist
+        absent = 2 if version >= SIZED else 1  # skeletons, and assets if the bitstream has them
         labeled = bodies[1] + absent * head + head
         markers = _span(labeled, MARKER_LAYOUT.size * len(frame.markers))
         stamps = markers[1] + 2 * head  # no force plates and no devices
@@ -136,7 +138,7 @@ class FrameLayout:
         return FrameLayout(places, datagram) if end + END_LAYOUT.size == len(datagram) else None
 
     def read(self, datagram: bytes) -> FrameOfData | None:
-        """Return the frame in `datagram`; None if it has another layout."""
+        """Return the frame in `datagram`; None if the frame has a different layout."""
         if len(datagram) != self._size:
             return None
         if int.from_bytes(datagram, "little") & self._mask != self._fixed:

@@ -1,13 +1,13 @@
-"""Times of other clocks than the server's in a NatNet frame: precision timestamp and timecode.
+"""Times in a NatNet frame that do not come from the server's clock.
 
-The precision timestamp, two u32, comes from a PTP clock: seconds, and a fraction whose unit the
-vendor does not document. A fraction of 10^9 or more implies units of 2^-32 s. If twenty frames
-contain no such fraction, the unit is nanoseconds. Of twenty uniformly distributed fractions in
-2^-32 s, at least one would be 10^9 or more with probability 1 - 0.23^20. Two zeros indicate that
-the server has no PTP clock.
+These are the precision timestamp and the timecode. The precision timestamp consists of two u32 from
+a PTP clock: seconds, and a fraction whose unit the vendor does not document. A fraction of 10^9 or
+more implies units of 2^-32 s. If no such fraction occurs in twenty frames, the unit is nanoseconds.
+With units of 2^-32 s, at least one of twenty uniformly distributed fractions would be 10^9 or more
+with probability 1 - 0.23^20. If both numbers are zero, the server has no PTP clock.
 
-The timecode (SMPTE, LTC) has hours, minutes, seconds and frames in its bytes 3 to 0, and a separate
-subframe; zeros mean that there is none.
+The timecode (SMPTE, LTC) contains hours, minutes, seconds and frames in its bytes 3 to 0, and a
+separate subframe. Zeros mean that there is no timecode.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _NS = 10**9
 DECIDING = 20
-"""Frames that determine the unit of the fraction."""
+"""Number of frames that determine the unit of the fraction."""
 
 
 class Timecode(NamedTuple):
@@ -39,7 +39,7 @@ class Timecode(NamedTuple):
 
 
 def timecode_of(frame: FrameOfData) -> Timecode | None:
-    """Return the timecode of a frame; None if it has none."""
+    """Return the timecode of a frame; None if the frame has none."""
     if not frame.timecode and not frame.subframe:
         return None
     hour, minute, second, count = frame.timecode.to_bytes(4, "big")
@@ -47,22 +47,22 @@ def timecode_of(frame: FrameOfData) -> Timecode | None:
 
 
 class PrecisionTime:
-    """Converts precision timestamps to ns, once the unit of their fraction is known."""
+    """Converts precision timestamps to ns when the unit of their fraction is known."""
 
     def __init__(self) -> None:
         self._binary: bool | None = None
         self._seen = 0
 
         self.absent = 0
-        """Consecutive frames without a precision timestamp."""
+        """Number of consecutive frames without a precision timestamp."""
 
     @property
     def decided(self) -> bool:
-        """Whether the unit is known."""
+        """Whether the unit of the fraction is known."""
         return self._binary is not None
 
     def ns(self, precision: tuple[int, int] | None) -> int | None:
-        """Return the time in ns of its clock; None without one, or before the unit is known."""
+        """Return the time in ns of its clock; None if it is missing or its unit is unknown."""
         if precision is None or precision == (0, 0):
             self.absent += 1
             return None

@@ -2,8 +2,8 @@
 
     | u16 id | u16 payload length | payload |      little-endian; length = the datagram's - 4
 
-`decode` accepts datagrams of both directions: a capture contains both, and a simulator decodes the
-datagrams of a driver.
+`decode` accepts datagrams of both directions, because a capture contains both. In addition, a
+simulator decodes the datagrams of a driver.
 
 Source: NaturalPoint NatNet SDK 4.1, NatNetTypes.h; a capture of Motive 2.1.
 """
@@ -37,7 +37,7 @@ _INFO_TAIL = struct.Struct("<QHB4B")
 
 
 class NatNetMessageId(IntEnum):
-    """First field of the header."""
+    """Message id, which is the first field of the header."""
 
     CONNECT = 0
     SERVERINFO = 1
@@ -63,64 +63,64 @@ class ServerInfo(NamedTuple):
     application: str
     application_version: Version4
     natnet_version: Version4
-    """NatNet version of the server; its first two numbers are the bitstream in use unless
+    """NatNet version of the server. Its first two numbers are the bitstream in use, unless it was
     changed."""
     clock_hz: int | None
-    """Ticks per second of the stamps in frames; None from a 2.x server."""
+    """Number of ticks per second of the stamps in frames; None for a 2.x server."""
     data_port: int = 1511
     multicast: bool = False
     group: str = "239.255.42.99"
 
     @property
     def bitstream(self) -> Version:
-        """The bitstream this server starts with."""
+        """Bitstream version that the server uses at first."""
         return self.natnet_version[:2]
 
 
 class Discovery(NamedTuple):
-    """CONNECT as a broadcast; every server answers."""
+    """CONNECT as a broadcast, which every server answers."""
 
     connect: Connect
 
 
 class CommandRequest(NamedTuple):
-    """A command as text: ``FrameRate``, ``Bitstream,4.1`` and so on."""
+    """A text command, such as ``FrameRate`` or ``Bitstream,4.1``."""
 
     command: str
 
 
 class CommandResponse(NamedTuple):
-    """The answer to a `CommandRequest`: int32, float32 or text, depending on the request."""
+    """The answer to a `CommandRequest`: int32, float32 or text, depending on the command."""
 
     data: bytes
 
     @property
     def text(self) -> str:
-        """The answer read as a string."""
+        """Answer interpreted as text."""
         return fixed_text(self.data)
 
 
 class MessageString(NamedTuple):
-    """Text for the operator."""
+    """Text that the server sends for the operator."""
 
     text: str
 
 
 class EchoRequest(NamedTuple):
-    """A stamp chosen by the client."""
+    """Request with a stamp that the client chooses."""
 
     stamp: int
 
 
 class EchoResponse(NamedTuple):
-    """The client's stamp, and the server's ticks at its arrival."""
+    """Answer with the client's stamp, and the server's ticks at the arrival of the request."""
 
     stamp: int
     ticks: int
 
 
 class Bare(NamedTuple):
-    """A message that consists of its id; bytes after the header have no meaning."""
+    """A message that consists only of its id. Bytes after the header have no meaning."""
 
     id: NatNetMessageId
 
@@ -141,9 +141,10 @@ Message = (
 
 
 def decode(datagram: bytes, version: Version) -> Message | CorruptBytes:
-    """Return the message in `datagram`, with frames and models in bitstream `version`.
+    """Return the message in `datagram`; frames and models are in bitstream `version`.
 
-    Never raises: a datagram that is no complete and exact message is `CorruptBytes` as a whole.
+    The function never raises. A datagram that is not one complete message becomes a single
+    `CorruptBytes`.
     """
     if len(datagram) < HEADER.size:
         return CorruptBytes(len(datagram), "shorter than a header")
@@ -177,12 +178,12 @@ def is_versioned(datagram: bytes) -> bool:
 
 
 def encode(message: Message, version: Version = (3, 0)) -> bytes:
-    """Return `message` as one datagram, with frames and models in bitstream `version`.
+    """Return `message` as one datagram; frames and models are in bitstream `version`.
 
     Raises
     ------
     ValueError
-        The message does not exist in that bitstream, or exceeds one datagram.
+        The message does not exist in this bitstream, or is too long for one datagram.
     """
     number, payload = _payload(message, version)
     if len(payload) + HEADER.size > MAX_DATAGRAM:
@@ -214,7 +215,7 @@ def _read_discovery(data: bytes) -> Discovery | None:
 def _fixed(
     kind: type[EchoRequest | EchoResponse], layout: struct.Struct
 ) -> Callable[[bytes], Message | None]:
-    """Return the reader of a message that consists of one record."""
+    """Return a reader for a message that consists of a single record."""
     return lambda data: kind(*layout.unpack(data)) if len(data) == layout.size else None
 
 

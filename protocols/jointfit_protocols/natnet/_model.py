@@ -1,11 +1,11 @@
-"""NatNet MODELDEF: the descriptions of the ids in frames, as sent.
+"""NatNet MODELDEF: descriptions of the ids that frames contain, as sent.
 
     i32 n, then n x { i32 type, [>= 4.1: i32 bytes], description }
 
-From 4.1, the byte size allows every description to be skipped, known or not. In older versions
-an unknown type ends the decoding: earlier descriptions are returned, and
-`ModelDefinition.complete` is false. Only one client documents the quaternion that some 4.2
-descriptions have behind the offset; the size of the description decides whether it is present.
+From bitstream 4.1 on, the size permits every description to be skipped, even an unknown one. In
+older bitstreams, an unknown type ends the decoding. The earlier descriptions are returned, and
+`ModelDefinition.complete` is false. Some 4.2 servers send a quaternion after the offset, which only
+one client documents. The size of the description shows whether it is present.
 
 Source: NaturalPoint NatNet SDK 4.1, NatNetTypes.h and PythonClient.
 """
@@ -23,7 +23,7 @@ from jointfit_protocols.natnet._frame import SIZED, TICKED, Position, Version, s
 
 
 class DescriptionType(IntEnum):
-    """First field of a description."""
+    """Type of a description, which is its first field."""
 
     MARKER_SET = 0
     RIGID_BODY = 1
@@ -46,7 +46,7 @@ _SMALLEST = 8  # type and size, or type and the shortest description
 
 
 class MarkerSetDescription(NamedTuple):
-    """Names of the markers of one set, in the order of its positions in the frames."""
+    """Names of the markers in one set, in the order of the positions in the frames."""
 
     name: str
     markers: tuple[str, ...]
@@ -57,23 +57,23 @@ class BodyDescription(NamedTuple):
 
     name: str
     id: int
-    """Streaming id, editable by the operator: two bodies may have the same one."""
+    """Streaming id. The operator can edit it, so two bodies may have the same id."""
     parent: int = -1
     offset: Position = (0.0, 0.0, 0.0)
-    """Already applied to the streamed pose: not to be added."""
+    """Offset that the server has already applied to the pose. It must not be added."""
     positions: tuple[Position, ...] = ()
-    """Markers in the body, m."""
+    """Positions of the markers in the body, m."""
     labels: tuple[int, ...] = ()
-    """Active labels of the markers, 0 for passive ones."""
+    """Active labels of the markers; 0 for passive markers."""
     markers: tuple[str, ...] = ()
-    """Marker names, from 4.0."""
+    """Names of the markers (bitstream 4.0 and later)."""
     rotation: tuple[float, float, float, float] | None = None
-    """Offset quaternion x, y, z, w if the server sends an offset, as some servers of version 4.2
-    do."""
+    """Offset quaternion x, y, z, w; None if the server sends none. Some servers of version 4.2 send
+    it."""
 
 
 class SkeletonDescription(NamedTuple):
-    """One skeleton; a bone's pose has id ``skeleton << 16 | bone`` in the frames."""
+    """One skeleton. In the frames, the pose of a bone has the id ``skeleton << 16 | bone``."""
 
     name: str
     id: int
@@ -81,7 +81,7 @@ class SkeletonDescription(NamedTuple):
 
 
 class PlateDescription(NamedTuple):
-    """One force plate with the numbers as sent."""
+    """One force plate, with the numbers as sent."""
 
     id: int
     serial: str
@@ -120,7 +120,7 @@ class AssetMarkerDescription(NamedTuple):
 
 
 class AssetDescription(NamedTuple):
-    """One trained marker set (from 4.1)."""
+    """One trained marker set (bitstream 4.1 and later)."""
 
     name: str
     type: int
@@ -130,7 +130,7 @@ class AssetDescription(NamedTuple):
 
 
 class UnknownDescription(NamedTuple):
-    """A description skipped by its size (from 4.1)."""
+    """A description that was skipped by its size (bitstream 4.1 and later)."""
 
     type: int
     data: bytes
@@ -149,16 +149,16 @@ Description = (
 
 
 class ModelDefinition(NamedTuple):
-    """All descriptions of one server, in its order."""
+    """All descriptions of one server in the order of sending."""
 
     descriptions: tuple[Description, ...]
     complete: bool = True
-    """Whether all descriptions were read; False if an unknown type ended the decoding (below
-    4.1)."""
+    """Whether all descriptions were read. False means that an unknown type ended the decoding,
+    which is possible below bitstream 4.1."""
 
 
 def decode_model(datagram: bytes, version: Version) -> ModelDefinition | CorruptBytes:
-    """Return the descriptions in a whole MODELDEF datagram (header included); never raises."""
+    """Return the descriptions in a complete MODELDEF datagram with header; never raise."""
     if not supported(version):
         return CorruptBytes(
             len(datagram), f"NatNet bitstream {version[0]}.{version[1]} is not supported"
@@ -182,7 +182,7 @@ def _read_sized(cursor: Cursor, n: int, version: Version) -> ModelDefinition:
         at = cursor.at
         description: Description | None = None
 
-        # The size decides whether the 4.2 quaternion is present.
+        # The size shows whether the quaternion of some 4.2 servers is present.
         for rotated in (False, True):
             if description is None:
                 cursor.at = at
@@ -204,7 +204,7 @@ def _read(cursor: Cursor, n: int, version: Version) -> ModelDefinition:
 
 
 class _Reader:
-    """Reads descriptions of one version, with or without the offset quaternion."""
+    """Reads descriptions of one bitstream version, with or without the offset quaternion."""
 
     def __init__(self, cursor: Cursor, version: Version, rotated: bool) -> None:
         self._cursor = cursor

@@ -1,6 +1,6 @@
 """Encoder of NatNet MODELDEF, for simulators and tests.
 
-Invariant: a model of a real server that `decode_model` has decoded is encoded byte for byte.
+Invariant: encoding a model that `decode_model` decoded returns the bytes of the real server.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from jointfit_protocols.natnet._model import (
 
 
 def encode_model(model: ModelDefinition, version: Version) -> bytes:
-    """Return the payload (without message header) of `model` in bitstream `version`.
+    """Return the payload of `model` in bitstream `version`, without the message header.
 
     Raises
     ------
     ValueError
-        The bitstream version is older than 2.5, or does not contain one of the descriptions.
+        The bitstream is older than 2.5, or does not have one of the descriptions.
     """
     if not supported(version):
         raise ValueError(f"bitstream {version[0]}.{version[1]} is not written")

@@ -1,11 +1,11 @@
 """Components of a data packet: markers, 6DOF bodies, skeletons and timecodes.
 
-A component is ``u32 size, u32 type, data``; the size includes these 8 bytes. Positions are
-millimetres. Rotations are column-major, body to world. A marker or body that the cameras do not see
-has all bits of its numbers set, which is a NaN.
+A component is ``u32 size, u32 type, data``. The size includes these 8 bytes. Positions are in
+millimetres. Rotation matrices are in column-major order, from body to world. For a marker or body
+that is not visible, all bits of its numbers are set, which is a NaN.
 
-Invariant: a count is compared with the bytes of its component before anything is read; a component
-of a known type is read only if it ends exactly at its size.
+Invariant: a count is compared with the size of its component before anything is read. A component
+of a known type is accepted only if its content has exactly its size.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 
 class ComponentType(IntEnum):
-    """Types of components of which the content is read; others are skipped by their size."""
+    """Types of components whose content is read. All other components are skipped by their size."""
 
     MARKERS = 1
     UNLABELED = 2
@@ -40,12 +40,12 @@ ITEM_LAYOUTS: dict[int, Struct] = {
     ComponentType.BODIES_EULER: Struct("<6f"),
     ComponentType.BODIES_EULER_RESIDUAL: Struct("<7f"),
 }
-"""Layout of one marker or body of each type: position, then id, rotation, residual."""
+"""Layout of one marker or body of each type: position, followed by id, rotation and residual."""
 
 COMPONENT_HEAD = Struct("<II")
-"""Size and type."""
+"""Layout of the head of a component: size and type."""
 _ITEMS_HEAD = Struct("<Ihh")
-"""Number of items, 2D drop rate and out-of-sync rate."""
+"""Layout of the head of items: number of items, 2D drop rate and out-of-sync rate."""
 _COUNT = Struct("<I")
 _TIMECODE = Struct("<III")
 _SEGMENT = Struct("<I7f")
@@ -55,15 +55,15 @@ _YEAR_BITS, _DAY_AT, _TENTHS_BITS = 0x7F, 7, 0xF
 
 
 class ItemsComponent(NamedTuple):
-    """Markers or bodies, in the order of the settings XML; unlabeled markers have an id."""
+    """Markers or bodies in the order of the settings XML. Unlabeled markers have an id."""
 
     type: int
     drop_rate: int
-    """Share of frames of which cameras dropped 2D data in the last second, per mille."""
+    """Share of frames in the last second for which cameras dropped 2D data, per mille."""
     sync_rate: int
     """Share of frames that arrived out of sync, per mille."""
     items: tuple[tuple[float, ...], ...]
-    """Numbers of each item in the layout of its type."""
+    """Numbers of each item, in the layout of its type."""
 
 
 class TimecodeType(IntEnum):
@@ -83,12 +83,12 @@ class QtmTimecode(NamedTuple):
 
     @property
     def camera_ticks(self) -> int | None:
-        """Exposure on the clock of the cameras, in units of 100 ns; None for other types."""
+        """Exposure on the cameras' clock, in units of 100 ns; None for other types of timecode."""
         return self.high << 32 | self.low if self.type == TimecodeType.CAMERA else None
 
     @property
     def text(self) -> str | None:
-        """Time of day as text; None for camera time and unknown types."""
+        """Time of day as text; None for camera time and for unknown types."""
         low = self.low
         clock = (
             f"{low & _FIVE_BITS:02}:{low >> _MINUTES_AT & _SIX_BITS:02}:"
@@ -104,14 +104,14 @@ class QtmTimecode(NamedTuple):
 
 
 class TimecodeComponent(NamedTuple):
-    """Timecodes of the frame."""
+    """All timecodes of a frame."""
 
     timecodes: tuple[QtmTimecode, ...]
     type: int = ComponentType.TIMECODE
 
 
 class SkeletonSegment(NamedTuple):
-    """Pose of one segment of a skeleton: mm, quaternion as on the wire."""
+    """Pose of one segment of a skeleton: position in mm, quaternion as on the wire."""
 
     id: int
     x: float
@@ -124,14 +124,17 @@ class SkeletonSegment(NamedTuple):
 
 
 class SkeletonComponent(NamedTuple):
-    """Skeletons in the order of the settings XML; one that is not seen has no segments."""
+    """Skeletons in the order of the settings XML.
+
+    A skeleton that is not visible has no segments.
+    """
 
     skeletons: tuple[tuple[SkeletonSegment, ...], ...]
     type: int = ComponentType.SKELETON
 
 
 class OpaqueComponent(NamedTuple):
-    """A component of a type that is not read, such as analog or force data."""
+    """A component whose type is not read, such as analog or force data."""
 
     type: int
     data: bytes
@@ -141,7 +144,7 @@ Component = ItemsComponent | TimecodeComponent | SkeletonComponent | OpaqueCompo
 
 
 def decode_component(kind: int, data: memoryview) -> Component | str:
-    """Return the component of a type, or the reason for which its data are corrupt."""
+    """Return the component of a type, or the reason why its data are corrupt."""
     layout = ITEM_LAYOUTS.get(kind)
     if layout is not None:
         if len(data) < _ITEMS_HEAD.size:
@@ -195,7 +198,7 @@ def _decode_skeletons(data: memoryview) -> SkeletonComponent | str:
 
 
 def encode_component(component: Component) -> bytes:
-    """Return the bytes of a component, its header included."""
+    """Return the bytes of a component, including its header."""
     kind, data = component.type, b""
     match component:
         case ItemsComponent(kind, drop_rate, sync_rate, items):

@@ -1,7 +1,7 @@
-"""Packets of the QTM real-time protocol: ``u32 size, u32 type, data``, size included.
+"""Packets of the QTM real-time protocol: ``u32 size, u32 type, data``, with the whole size.
 
-Invariant: `decode` never raises, and reads no count or size that exceeds the packet. The same
-packets are sent over TCP and, with data only, over UDP.
+Invariant: `decode` never raises, and never reads more than the packet, whatever count or size it
+states. TCP and UDP use the same packets, but UDP only for data.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from jointfit_protocols.qtm._components import (
 )
 
 HEADER = Struct("<II")
-"""Size and type."""
+"""Layout of the header of a packet: size and type."""
 LARGEST_PACKET = 16 << 20
-"""Largest accepted packet, bytes; a camera frame with thousands of markers has 100 kB."""
+"""Largest accepted packet, bytes. A camera frame with thousands of markers has 100 kB."""
 _LARGEST_TYPE = 0xFF
-"""Largest plausible type of a packet; known ones are below 9."""
+"""Largest plausible type of a packet. Known types are below 9."""
 _LARGEST_TEXT = 4 << 20
-"""Largest accepted XML or text, bytes."""
+"""Largest accepted XML document or text, bytes."""
 _FRAME_HEAD = Struct("<qII")
-"""Timestamp, µs; frame number; number of components."""
+"""Layout of the head of a frame: timestamp, µs; frame number; number of components."""
 _DISCOVER_PORT = Struct(">H")
 
 
@@ -47,7 +47,7 @@ class PacketType(IntEnum):
 
 
 class QtmEvent(IntEnum):
-    """Events of a server."""
+    """Events that a server reports."""
 
     CONNECTED = 1
     CONNECTION_CLOSED = 2
@@ -68,7 +68,7 @@ class QtmEvent(IntEnum):
 
 
 class ErrorReply(NamedTuple):
-    """An error text of the server."""
+    """An error text from the server."""
 
     text: str
 
@@ -80,38 +80,38 @@ class Command(NamedTuple):
 
 
 class SettingsReply(NamedTuple):
-    """Settings of the server as XML."""
+    """Settings of the server as an XML document."""
 
     xml: str
 
 
 class DataFrame(NamedTuple):
-    """One camera frame, or over UDP a part of a camera frame."""
+    """One camera frame. Over UDP, it may be a part of a camera frame."""
 
     timestamp_us: int
-    """Time since the measurement began, µs."""
+    """Time since the beginning of the measurement, µs."""
     number: int
     components: tuple[Component, ...]
 
 
 class NoMoreData(NamedTuple):
-    """The measurement has ended, or has not begun."""
+    """Message that the measurement has ended or has not begun."""
 
 
 class Event(NamedTuple):
-    """A state change of the server: one of `QtmEvent`, or a newer one."""
+    """A state change of the server: a `QtmEvent` or a number of a newer version."""
 
     number: int
 
 
 class Discover(NamedTuple):
-    """Request of a client, by UDP broadcast, to answer to one of its ports."""
+    """UDP broadcast of a client, which requests answers to one of the client's ports."""
 
     port: int
 
 
 class SkippedPacket(NamedTuple):
-    """A packet of a type that is not read: a file, or a newer type."""
+    """A packet whose type is not read: a file or a newer type."""
 
     type: int
     data: bytes
@@ -137,12 +137,12 @@ class ServerAnnouncement(NamedTuple):
 
 
 def decode(packet: bytes) -> Message | CorruptBytes:
-    """Return the message of one whole packet; never raises.
+    """Return the message in one complete packet; never raise.
 
     Parameters
     ----------
     packet : bytes
-        A packet from TCP as `QtmStream` splits it, or one datagram.
+        Packet that `QtmStream` split from a TCP connection, or one datagram.
     """
     if len(packet) < HEADER.size:
         return CorruptBytes(len(packet), "shorter than a packet header")
@@ -183,7 +183,7 @@ def _decode_frame(packet: bytes) -> DataFrame | CorruptBytes:
 
 
 def _decode_components(packet: bytes, at: int, count: int) -> tuple[Component, ...] | str:
-    """Return `count` components that fill a packet from `at`, or why they do not."""
+    """Return `count` components that fill a packet from `at` on, or the reason why they do not."""
     size = len(packet)
     if count * COMPONENT_HEAD.size > size - at:
         return f"{count} components in {size - at} bytes"
@@ -205,7 +205,7 @@ def _decode_components(packet: bytes, at: int, count: int) -> tuple[Component, .
 
 
 def encode(message: Message) -> bytes:
-    """Return the packet of a message; texts end with a NUL."""
+    """Return the packet of a message. Texts end with a NUL."""
     kind, data = 0, b""
     match message:
         case ErrorReply(text):
@@ -241,7 +241,7 @@ def _packet_size(buffer: bytearray, at: int) -> int | None:
 
 
 def decode_announcement(datagram: bytes) -> ServerAnnouncement | CorruptBytes:
-    """Return the answer to a discovery; its port follows the text and is big-endian."""
+    """Return the answer to a discovery. Its port follows the text and is big-endian."""
     shortest = HEADER.size + 1 + _DISCOVER_PORT.size
     if len(datagram) < shortest:
         return CorruptBytes(len(datagram), f"{len(datagram)} bytes, expected {shortest} or more")

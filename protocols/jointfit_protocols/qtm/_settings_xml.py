@@ -1,10 +1,12 @@
-"""Settings of a QTM server, from the XML that answers ``GetParameters``.
+"""Settings of a QTM server, parsed from the XML document that answers ``GetParameters``.
 
 The layout changed with version 1.21: `Body` has attributes of points instead of elements, and
-segments of skeletons are nested. Both are read; only direct children are, because meshes and
-points have names, too. The root is ``QTM_Parameters_Ver_x.y`` or ``QTM_Settings``.
+segments of skeletons are nested. Both layouts are supported. Only direct children are read, because
+meshes and points also have names. The root element is ``QTM_Parameters_Ver_x.y`` or
+``QTM_Settings``.
 
-Invariant: bounded input, no entities, and no exception: text that is not such a document is None.
+Invariant: the size of the input is limited, entities are rejected, and no exception is raised. If
+the text is not such a document, the result is None.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ _LARGEST = 4 << 20
 _LONGEST_NAME = 255
 _MOST_DIGITS = 10
 _DECLARATIONS = ("<!DOCTYPE", "<!ENTITY")
-"""Declarations that settings of QTM never contain, and by which a document could grow."""
+"""Declarations that QTM settings never contain, and with which a document could grow."""
 
 
 class QtmBody(NamedTuple):
@@ -25,13 +27,14 @@ class QtmBody(NamedTuple):
 
     name: str
     enabled: bool = True
-    """Whether it is tracked; always true below version 1.24, which has no such element."""
+    """Whether the body is tracked. It is always true below version 1.24, which has no such
+    element."""
     relative: bool = False
-    """Whether its pose is relative to another body, and not to the world."""
+    """Whether the pose of the body is relative to another body instead of the world."""
     fixed: bool = False
-    """Whether its pose is relative to a fixed pose, and not to the world."""
+    """Whether the pose of the body is relative to a fixed pose instead of the world."""
     points: tuple[str, ...] = ()
-    """Names of its points, empty texts below version 1.21."""
+    """Names of the points of the body; empty texts below version 1.21."""
 
 
 class QtmSkeleton(NamedTuple):
@@ -43,16 +46,16 @@ class QtmSkeleton(NamedTuple):
 
 
 class QtmSettingsXml(NamedTuple):
-    """Parts of the settings; None for a part that the document lacks."""
+    """Parts of the settings. A part that the document lacks is None."""
 
     frequency_hz: float | None = None
     timestamp_enabled: bool | None = None
     timestamp_type: str | None = None
-    """``SMPTE``, ``IRIG`` or camera time, as QTM writes it."""
+    """``SMPTE``, ``IRIG`` or camera time, in the spelling of QTM."""
     tracks_bodies: bool | None = None
     """Whether 6DOF bodies are tracked in real time."""
     up_axis: str | None = None
-    """``+Z`` and so on: the axis that points upwards."""
+    """Axis that points upwards, such as ``+Z``."""
     calibrated: str | None = None
     """Time of the last calibration; empty if the cameras are not calibrated."""
     labels: tuple[str, ...] | None = None
@@ -63,7 +66,7 @@ class QtmSettingsXml(NamedTuple):
 
 
 def parse_settings(text: str) -> QtmSettingsXml | None:
-    """Return the settings of an XML document; None if it is not a document of QTM."""
+    """Return the settings in an XML document; None if it is not a QTM document."""
     text = text.strip()
     if len(text) > _LARGEST or any(word in text for word in _DECLARATIONS):
         return None

@@ -1,12 +1,11 @@
-"""CAN frames of one device, described by a table, joined to samples.
+"""Assembly of samples from the CAN frames of one device that a table describes.
 
 The frames of a sample arrive in a known order, usually the order of the identifiers. The last frame
-completes the sample. A frame that repeats or precedes an earlier frame begins the next sample. A
-frame that arrives more than `longest_ns` after the first frame also begins the next sample. Samples
-without all their measurements are incomplete and dropped; time, counter and validity may be
-missing.
+completes the sample. The next sample begins with a frame that repeats or precedes an earlier frame,
+or that arrives more than `longest_ns` after the first frame. Samples without all their measurements
+are incomplete, and are dropped. Time, counter and validity may be missing.
 
-Invariant: frames in, samples out; no bus, no clock.
+Invariant: the codec converts frames to samples. It uses no bus and no clock.
 """
 
 from __future__ import annotations
@@ -25,42 +24,42 @@ CanKey = tuple[int, bool]
 
 
 class CanTable(NamedTuple):
-    """Description of the frames of a device."""
+    """Layout of the frames of a device."""
 
     keys: tuple[CanKey, ...]
-    """Identifier of each frame, and whether it has 29 bits, in the order of sending."""
+    """Identifier of each frame and whether it has 29 bits, in the order of sending."""
     fields: Mapping[int, TableField]
-    """Place of each slot of the record; `TableField.frame` is an index of `keys`."""
+    """Position of each slot of the record. `TableField.frame` is an index of `keys`."""
     longest_ns: int = 1_000_000_000
-    """Most time between the first and the last frame of a sample, ns."""
+    """Longest time between the first and the last frame of a sample, ns."""
     names: tuple[str, ...] = ()
-    """Names of the frames in reasons."""
+    """Names of the frames, which are used in messages."""
 
 
 class CanSample(NamedTuple):
-    """One sample as sent."""
+    """One sample, with its numbers as sent."""
 
     t_ns: int
-    """Stamp of its first frame."""
+    """Stamp of the first frame, ns."""
     values: tuple[float | None, ...]
-    """Record of the sample; None for numbers of a missing frame."""
+    """Record of the sample. Numbers of a missing frame are None."""
     data: tuple[bytes, ...]
-    """Data of its frames; empty for a missing one."""
+    """Data bytes of each frame; empty for a missing frame."""
 
 
 class CanTableCodec:
-    """Decoder of one device's frames to samples; never raises.
+    """Codec that converts one device's frames to samples; it never raises.
 
     Parameters
     ----------
     table : CanTable
-        Description of the frames.
+        Layout of the frames.
     """
 
     def __init__(self, table: CanTable) -> None:
         self._table = table
         self.slots = tuple(sorted(table.fields))
-        """Slots of a record, in its order."""
+        """Slots of a record, in the order of its numbers."""
         self._parts = [_FramePart(table, number) for number in range(len(table.keys))]
         self._numbers = {key: number for number, key in enumerate(table.keys)}
         self._single = len(table.keys) == 1
@@ -70,14 +69,14 @@ class CanTableCodec:
         self._values: list[float | None] = [None] * len(self.slots)
         self._complete = True  # whether no frame with measurements is missing
         self.messages = 0
-        """Well-formed frames of this device."""
+        """Number of well-formed frames of this device."""
         self.incomplete = 0
-        """Samples without all their measurements."""
+        """Number of samples without all their measurements."""
         self.foreign = 0
-        """Frames of other devices."""
+        """Number of frames of other devices."""
 
     def feed(self, frame: CanFrame) -> CanSample | CorruptBytes | None:
-        """Return the sample that `frame` completed, or None."""
+        """Return the sample that `frame` completes; None if it completes none."""
         t_ns, can_id, data, extended, error, remote = frame
         number = self._numbers.get((can_id, extended))
         if number is None or error or remote:
@@ -106,7 +105,7 @@ class CanTableCodec:
         return self._finish() if self._next == len(self._parts) else None
 
     def flush(self) -> None:
-        """Discard an open sample."""
+        """Discard an incomplete sample."""
         if self._next:
             self.incomplete += 1
         self._begin()
@@ -127,7 +126,7 @@ class CanTableCodec:
 
 
 class _FramePart:
-    """The numbers of one frame."""
+    """Numbers that one frame contains."""
 
     def __init__(self, table: CanTable, number: int) -> None:
         slots = sorted(table.fields)
@@ -142,21 +141,22 @@ class _FramePart:
 def encode_can_frames(
     table: CanTable, values: Sequence[float], sizes: Sequence[int] | None = None
 ) -> list[tuple[CanKey, bytes]]:
-    """Return identifier and data of each frame of a sample, in the order of sending.
+    """Return the identifier and the data of each frame of a sample, in the order of sending.
 
     Parameters
     ----------
     table : CanTable
-        Description of the frames.
+        Layout of the frames.
     values : sequence of float
-        The record, as sent, in the order of its slots.
+        Record with the numbers as sent, in the order of its slots.
     sizes : sequence of int, optional
-        Number of data bytes of each frame; by default the bytes that the fields occupy.
+        Number of data bytes of each frame. By default, it is the number of bytes that the fields
+        use.
 
     Raises
     ------
     struct.error, OverflowError
-        A number does not fit its place.
+        A number does not fit into its field.
     """
     slots = sorted(table.fields)
     frames = []

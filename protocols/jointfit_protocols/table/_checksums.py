@@ -1,4 +1,4 @@
-"""Checksums of frames by parameters: sums, XOR, Fletcher and CRC.
+"""Checksums of frames, which parameters describe: sums, XOR, Fletcher and CRC.
 
 | kind       | value                                                                       |
 |------------|-----------------------------------------------------------------------------|
@@ -8,10 +8,10 @@
 | crc8       | polynomial, init, reflected or not, as in the catalogue of parametrised CRC |
 | crc16      | algorithms; crc32 likewise                                                  |
 
-`xor_out` is applied to the result. A sum whose total with its checksum is 0 modulo 256 (two's
-complement) has init = xor_out = 0xFF.
+`xor_out` is combined with the result by XOR. A sum that, together with its checksum, is 0 modulo
+256 (two's complement) has init = xor_out = 0xFF.
 
-Invariant: pure functions of bytes; the parameters are compiled once.
+Invariant: the checksums are pure functions of bytes. Parameters are compiled only once.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ ChecksumKind = Literal["sum8", "sum16", "xor8", "fletcher16", "crc8", "crc16", "
 WIDTHS: dict[ChecksumKind, int] = {
     "sum8": 1, "sum16": 2, "xor8": 1, "fletcher16": 2, "crc8": 1, "crc16": 2, "crc32": 4,
 }  # fmt: skip
-"""Length of each checksum, bytes."""
+"""Length of each type of checksum, bytes."""
 _CCITT = 0x1021
-"""Polynomial of CRC-16 for which the standard library has a function."""
+"""Polynomial of the CRC-16 for which the standard library has a function."""
 _CRC32 = 0x04C11DB7
 _POLYNOMIALS = {"crc8": 0x07, "crc16": _CCITT, "crc32": _CRC32}
 _BYTE = 8
@@ -45,29 +45,29 @@ class Checksum(NamedTuple):
 
     kind: ChecksumKind
     first: int = 0
-    """First byte of the frame that the checksum includes; the last included byte precedes the
-    checksum."""
+    """First byte of the frame that the checksum includes. The last included byte is the byte before
+    the checksum."""
     byte_order: ByteOrder = "little"
-    """Byte order of the checksum in the frame. For fletcher16, ``little`` places the plain sum
-    first."""
+    """Byte order of the checksum in the frame. For fletcher16, ``little`` means that the plain sum
+    is first."""
     polynomial: int | None = None
-    """CRC polynomial without the highest bit and not reflected; None: 0x07, 0x1021 or
+    """CRC polynomial without the highest bit, not reflected. None selects 0x07, 0x1021 or
     0x04C11DB7."""
     init: int = 0
     reflected: bool = False
-    """Whether the CRC processes each byte from the least significant bit on."""
+    """Whether the CRC processes each byte from its least significant bit on."""
     xor_out: int = 0
     modulus: int = 256
     """Modulus of fletcher16, 256 or 255."""
 
     @property
     def width(self) -> int:
-        """Number of bytes."""
+        """Length of the checksum, bytes."""
         return WIDTHS[self.kind]
 
 
 def compile_checksum(checksum: Checksum) -> Callable[[bytes], int]:
-    """Return the function from the included bytes to the checksum."""
+    """Return a function that computes the checksum of the included bytes."""
     kind, init, xor_out = checksum.kind, checksum.init, checksum.xor_out
     if kind == "sum8":
         return lambda data: (sum(data) + init) & 0xFF ^ xor_out
@@ -85,7 +85,7 @@ def _fletcher(modulus: int, init: int, xor_out: int) -> Callable[[bytes], int]:
 
     def compute(data: bytes) -> int:
         plain = (first + sum(data)) % modulus
-        # the initial value is included in every partial sum
+        # Every partial sum includes the initial value.
         weighted = (second + sum(accumulate(data)) + len(data) * first) % modulus
         return (weighted << _BYTE | plain) ^ xor_out
 
@@ -128,7 +128,7 @@ def _compile_crc(checksum: Checksum) -> Callable[[bytes], int]:
 
 
 def _entry(byte: int, polynomial: int, width: int) -> int:
-    """Return the remainder of one byte."""
+    """Return the remainder of one byte, which is an entry of the CRC table."""
     crc, top, mask = byte << (width - _BYTE), 1 << (width - 1), (1 << width) - 1
     for _ in range(_BYTE):
         crc = (crc << 1 ^ polynomial if crc & top else crc << 1) & mask

@@ -1,17 +1,17 @@
-"""Numbers at fixed places of a frame: compiled once to ``struct`` formats, then read and written.
+"""Numbers at fixed positions in a frame. The positions are compiled once to ``struct`` formats.
 
-A record is the tuple of all numbers of one sample, as sent, in the order of their slots:
+A record is the tuple of all numbers of one sample as sent, in the order of their slots:
 
     slot   0..3        4..6   7..9          10..12    13    14       15
            quaternion  rate   acceleration  magnetic  time  counter  valid
            w x y z     x y z  x y z         x y z
 
-A record contains only the slots that the device sends. The place of a number is its first byte and
-the first bit in this byte. Bits count from the least significant bit for little-endian numbers,
-from the most significant bit for big-endian numbers.
+A record contains only the slots that the device sends. The position of a number consists of its
+first byte and the first bit in this byte. Bits are counted from the least significant bit for
+little-endian numbers, and from the most significant bit for big-endian numbers.
 
-Invariant: every frame of at least `FieldReader.size` bytes is read; nothing is interpreted for each
-sample.
+Invariant: every frame of at least `FieldReader.size` bytes can be read. No layout is interpreted
+while samples are read.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ SLOTS: dict[Quantity, range] = {
 }
 """Slots of each quantity in a record."""
 COMPONENTS = {"quaternion": "wxyz", "rate": "xyz", "acceleration": "xyz", "magnetic": "xyz"}
-"""Names of the components, in the order of their slots."""
+"""Letters of the components in the order of their slots."""
 MEASURED = 13
-"""Number of slots with components of measurements; the others are integers or times."""
+"""Number of slots for components of measurements. The other slots are integers or times."""
 
 _TYPE = re.compile(r"(?P<kind>[uif])(?P<bits>[1-9]\d?)")
 _FLOATS = (16, 32, 64)
@@ -52,39 +52,40 @@ _CODES = {
     ("i", 8): "b", ("i", 16): "h", ("i", 32): "i", ("i", 64): "q",
     ("f", 16): "e", ("f", 32): "f", ("f", 64): "d",
 }  # fmt: skip
-"""Codes of ``struct`` by kind and bits."""
+"""Codes of ``struct`` for each kind and number of bits."""
 
 
 class TableField(NamedTuple):
-    """Place and form of one number."""
+    """Position and type of one number."""
 
     offset: int
-    """First byte in the frame."""
+    """Index of the first byte in the frame."""
     kind: Kind
     """Unsigned integer, signed integer (two's complement), or float (IEEE 754)."""
     bits: int
     byte_order: ByteOrder = "little"
     bit: int = 0
-    """First bit in the first byte."""
+    """Index of the first bit in the first byte."""
     scale: float = 1.0
     """SI value of one count."""
     zero: float = 0.0
     """SI value of the count 0."""
     frame: int = 0
-    """Number of the frame that contains it, for devices that send several per sample."""
+    """Index of the frame that contains the number, for devices that send several frames per
+    sample."""
 
     @property
     def end(self) -> int:
-        """Number of bytes from the start of the frame to the last byte of this number."""
+        """Number of bytes from the start of the frame to the end of this number."""
         return self.offset + (self.bit + self.bits + 7) // 8
 
     @property
     def modulus(self) -> int:
-        """Number of values of the integer."""
+        """Number of different values of the integer."""
         return 1 << self.bits
 
     def occupied_bits(self) -> set[int]:
-        """Return the bits of the frame that this number occupies: 8 byte + significance."""
+        """Return the frame's bits that this number occupies, each as 8 · byte + significance."""
         first = 8 * self.offset + self.bit
         if self.byte_order == "little":
             return set(range(first, first + self.bits))
@@ -92,7 +93,7 @@ class TableField(NamedTuple):
 
 
 def parse_type(text: str) -> tuple[Kind, int] | None:
-    """Return kind and bits of a type such as ``i16``, ``u12`` or ``f32``; None for other texts."""
+    """Return kind and number of bits of a type such as ``i16`` or ``f32``; None for other texts."""
     match = _TYPE.fullmatch(text)
     if match is None:
         return None
@@ -116,12 +117,12 @@ def overlaps(fields: Mapping[str, TableField]) -> list[tuple[str, str]]:
 
 
 class FieldReader:
-    """Reader of numbers in frames, in the given order.
+    """Reads numbers from frames, in the given order.
 
     Parameters
     ----------
     fields : sequence of TableField
-        Numbers of one frame, which must not overlap.
+        Positions of the numbers in one frame, which must not overlap.
     """
 
     def __init__(self, fields: Sequence[TableField]) -> None:
@@ -142,10 +143,10 @@ class FieldReader:
         self._bits = [_BitField(fields[at]) for at in split]
         self._wire_order = [*taken, *split]
         self.read: Callable[[bytes, int], tuple[float, ...]] = self._compile()
-        """Return the numbers of the frame that begins at an index of `data`."""
+        """Return the numbers of the frame that begins at the given index of `data`."""
 
     def _compile(self) -> Callable[[bytes, int], tuple[float, ...]]:
-        """Return the shortest function that reads all numbers."""
+        """Return the fastest function that reads all numbers."""
         structs, bits, order = self._structs, self._bits, self._wire_order
         if len(structs) == 1 and not bits and order == sorted(order):
             plain: Callable[[bytes, int], tuple[float, ...]] = structs[0].unpack_from
@@ -174,12 +175,12 @@ class FieldReader:
         return read_mixed
 
     def write(self, frame: bytearray, values: Sequence[float]) -> None:
-        """Write numbers into a frame.
+        """Write the numbers of a record into a frame.
 
         Raises
         ------
         struct.error, ValueError, OverflowError
-            A value does not fit its field, or the number of values is wrong.
+            A value does not fit into its field, or the number of values is wrong.
         """
         rest = iter([values[at] for at in self._wire_order])
         for each in self._structs:
@@ -193,7 +194,7 @@ class FieldReader:
 
 
 class _BitField:
-    """An integer that is no whole number of bytes, or for which ``struct`` has no code."""
+    """An integer that does not fill whole bytes, or for which ``struct`` has no code."""
 
     def __init__(self, field: TableField) -> None:
         self._field = field
@@ -235,7 +236,7 @@ def slot_quantities(slots: Iterable[int]) -> tuple[Quantity, ...]:
 
 
 def _is_whole(field: TableField, order: ByteOrder) -> bool:
-    """Return whether ``struct`` reads the field with this byte order."""
+    """Return whether ``struct`` can read the field with this byte order."""
     if field.bit or (field.kind, field.bits) not in _CODES:
         return False
     return order == (field.byte_order if field.bits > 8 else "little")  # noqa: PLR2004 - one byte
@@ -246,7 +247,7 @@ def _by_place(fields: Sequence[TableField]) -> list[int]:
 
 
 def _format(fields: Sequence[TableField], order: ByteOrder) -> str:
-    """Return the format of fields in ascending order, with padding for the bytes in between."""
+    """Return the ``struct`` format of fields in ascending order, with padding between them."""
     text, at = "<" if order == "little" else ">", 0
     for field in fields:
         text += f"{field.offset - at}x" if field.offset > at else ""

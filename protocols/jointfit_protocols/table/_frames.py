@@ -1,17 +1,18 @@
-"""Binary frames of a serial device, described by a table.
+"""Binary frames of a serial device that a table describes.
 
      0       sync                                          length - end - checksum
     | sync | ... length, type, fields at fixed offsets ... | checksum | end |
 
-The length is fixed, or a field of the frame plus a constant. The checksum includes all bytes from a
-given one up to itself. A type field selects the frames with measurements; other valid frames are
-skipped and counted.
+The length is fixed, or is a field of the frame plus a constant. The checksum includes all bytes
+from a given byte up to the checksum itself. A type field identifies the frames with measurements.
+Other valid frames are skipped and counted.
 
-Without checksum, a frame counts only if it continues the previous one, or if the start of the next
-one follows it; otherwise sync bytes inside a frame would begin frames.
+Without a checksum, a frame is accepted only if it directly follows the previous frame, or if the
+start of another frame directly follows it. Otherwise, sync bytes inside a frame would be mistaken
+for the start of a frame.
 
-Invariant: bytes in, messages out; no port, no clock. The result does not depend on the pieces in
-which the bytes arrive.
+Invariant: the codec converts bytes to messages. It uses no port and no clock, and the boundaries of
+the byte strings do not matter.
 """
 
 from __future__ import annotations
@@ -30,27 +31,28 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 LONGEST_FRAME = 4096
-"""Maximum size of a frame in bytes; it bounds the wait after a corrupt length."""
+"""Largest size of a frame, bytes. It bounds the wait after a corrupt length."""
 
 
 class FrameFormat(NamedTuple):
-    """Description of the frames of a serial device."""
+    """Layout of the frames of a serial device."""
 
     sync: bytes
-    """First bytes of every frame."""
+    """Bytes with which every frame begins."""
     fields: Mapping[int, TableField]
-    """Place of each slot of the record."""
+    """Position of each slot of the record."""
     length: int | TableField
-    """Length of a frame, bytes, or the field that contains a length."""
+    """Length of a frame, bytes, or the field that contains the length."""
     length_adds: int = 0
-    """Length of a frame minus the value of its length field, bytes."""
+    """Difference between the length of a frame and the value of its length field, bytes."""
     longest: int = LONGEST_FRAME
-    """Maximum size of a frame with a length field in bytes."""
+    """Largest size of a frame with a length field, bytes."""
     checksum: Checksum | None = None
     end: bytes = b""
-    """Last bytes of every frame."""
+    """Bytes with which every frame ends."""
     message: tuple[TableField, int] | None = None
-    """Type field and its value in the frames with measurements; None: all frames have them."""
+    """Type field and its value in frames with measurements. None means that all frames have
+    them."""
 
 
 _NO_START = CorruptBytes(1, NO_START)
@@ -61,21 +63,21 @@ _ALONE = CorruptBytes(1, "no frame follows, and frames have no checksum")
 
 
 class FrameCodec(ResynchronizingCodec[TableMessage]):
-    """Decoder of pieces of any size to records; never raises.
+    """Codec that converts byte strings of any size to records; it never raises.
 
-    A run of bytes without a frame becomes one `CorruptBytes`. Frames of other types are messages
-    that `feed` does not return.
+    A run of bytes without a frame becomes one `CorruptBytes`. `feed` does not return frames of
+    other types.
 
     Parameters
     ----------
     form : FrameFormat
-        Description of the frames.
+        Layout of the frames.
     """
 
     def __init__(self, form: FrameFormat) -> None:
         self._form = form
         self.slots = tuple(sorted(form.fields))
-        """Slots of a record, in its order."""
+        """Slots of a record, in the order of its numbers."""
         self._reader = FieldReader([form.fields[slot] for slot in self.slots])
         self._read_fields = self._reader.read
 
@@ -101,15 +103,15 @@ class FrameCodec(ResynchronizingCodec[TableMessage]):
         self._in_step_at = -1  # bytes fed up to and including the previous frame
         self._is_final = False  # whether no further bytes can decide about a frame
         self.skipped = 0
-        """Valid frames of other types so far."""
+        """Number of valid frames of other types so far."""
 
     @property
     def longest(self) -> int:
-        """Maximum size of a frame in bytes."""
+        """Largest size of a frame, bytes."""
         return self._fixed or self._form.longest
 
     def feed(self, data: bytes) -> list[TableItem]:  # type: ignore[explicit-override]  # Python 3.12's
-        """Return the frames that `data` completed, in wire order; never raises."""
+        """Return the frames that `data` completes, in wire order; never raise."""
         skipped = self.skipped
         found = super().feed(data)
         if self.skipped == skipped:
@@ -117,17 +119,17 @@ class FrameCodec(ResynchronizingCodec[TableMessage]):
         return [item for item in found if not isinstance(item, TableMessage) or item.data]
 
     def flush(self) -> list[TableItem]:  # type: ignore[explicit-override]  # Python 3.12's
-        """End the input, or a silence: return frames hidden in the pending bytes."""
+        """End the input, or a silence; return frames that the pending bytes contain."""
         self._is_final = True
         found = self.feed(b"") + super().flush()
         self._is_final, self._in_step_at = False, -1
         return found
 
     def _read_frame(self, buffer: bytes, at: int, base: int) -> TableMessage | CorruptBytes | None:
-        """Return the frame that begins at `at`, the reason why none does, or None if it is cut."""
+        """Return the frame at `at`, the reason why there is none, or None if it is incomplete."""
         form, end = self._form, len(buffer)
         if not buffer.startswith(form.sync, at):
-            # the last bytes may be the first of the sync bytes
+            # The last bytes may be the beginning of the sync bytes.
             is_cut = end - at < len(form.sync) and form.sync.startswith(buffer[at:])
             return None if is_cut and not self._is_final else _NO_START
 
@@ -136,7 +138,7 @@ class FrameCodec(ResynchronizingCodec[TableMessage]):
             return None
         fault = _LENGTH if size < self._shortest_frame else self._fault(buffer, at, at + size)
         if fault is None and self._compute is None and base + at != self._in_step_at:
-            # without checksum the bytes behind the frame decide
+            # Without a checksum, the bytes after the frame decide whether it is valid.
             following = buffer[at + size : at + size + len(form.sync)]
             if not form.sync.startswith(following):
                 return _ALONE
@@ -145,7 +147,7 @@ class FrameCodec(ResynchronizingCodec[TableMessage]):
         return fault or self._message(buffer, at, at + size, base)
 
     def _size(self, buffer: bytes, at: int) -> int:
-        """Return the bytes from `at` that are needed to decide about a frame there."""
+        """Return the number of bytes from `at` on that are needed to decide about a frame there."""
         if self._fixed:
             return self._fixed
         if len(buffer) - at < self._head:
@@ -155,7 +157,7 @@ class FrameCodec(ResynchronizingCodec[TableMessage]):
         return size if self._shortest_frame <= size <= self._form.longest else self._head
 
     def _fault(self, buffer: bytes, at: int, stop: int) -> CorruptBytes | None:
-        """Return the reason why the bytes from `at` to `stop` are no frame."""
+        """Return the reason why the bytes from `at` to `stop` form no frame; None if they do."""
         end_bytes = self._form.end
         if end_bytes and not buffer.endswith(end_bytes, at, stop):
             return _END
@@ -167,7 +169,7 @@ class FrameCodec(ResynchronizingCodec[TableMessage]):
         return None
 
     def _message(self, buffer: bytes, at: int, stop: int, base: int) -> TableMessage | CorruptBytes:
-        """Return the record of a valid frame; without data if the frame has another type."""
+        """Return the record of a valid frame; it has no data if the frame has another type."""
         size, selects = stop - at, self._selects
         wanted = selects is None or (
             size >= selects.size and selects.read(buffer, at)[0] == self._expected
@@ -184,27 +186,28 @@ class FrameCodec(ResynchronizingCodec[TableMessage]):
 
 
 def _start_pattern(sync: bytes) -> re.Pattern[bytes]:
-    """Return a pattern of the sync bytes, or of their first ones at the end of a buffer."""
+    """Return a pattern for the sync bytes, or for their beginning at the end of a buffer."""
     beginnings = (re.escape(sync[:count]) + rb"\Z" for count in range(len(sync) - 1, 0, -1))
     return re.compile(b"|".join((re.escape(sync), *beginnings)))
 
 
 def encode_frame(form: FrameFormat, values: Sequence[float], size: int | None = None) -> bytes:
-    """Return the frame of a record.
+    """Return the frame that contains a record.
 
     Parameters
     ----------
     form : FrameFormat
-        Description of the frame.
+        Layout of the frame.
     values : sequence of float
-        The record, as sent, in the order of its slots.
+        Record with the numbers as sent, in the order of its slots.
     size : int, optional
-        Bytes of the frame; default: the fixed length, or the shortest frame with all fields.
+        Size of the frame, bytes. By default, it is the fixed length, or the shortest possible
+        length.
 
     Raises
     ------
     struct.error, OverflowError
-        A number does not fit its place.
+        A number does not fit into its field.
     """
     slots = sorted(form.fields)
     reader = FieldReader([form.fields[slot] for slot in slots])

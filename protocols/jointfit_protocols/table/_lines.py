@@ -1,12 +1,12 @@
-"""Text lines of a serial device, described by a table: one sample per line.
+"""Text lines of a serial device that a table describes, with one sample per line.
 
     prefix number separator number ... *checksum CR LF
 
-as an Arduino sketch prints them. Lines with another prefix are skipped and counted. The optional
+Arduino sketches print such lines. Lines with another prefix are skipped and counted. The optional
 checksum has the form of NMEA 0183: ``*`` and two or four hexadecimal digits.
 
-Invariant: bytes in, messages out; no port, no clock. The result does not depend on the pieces in
-which the bytes arrive.
+Invariant: the codec converts bytes to messages. It uses no port and no clock, and the boundaries of
+the byte strings do not matter.
 """
 
 from __future__ import annotations
@@ -21,36 +21,36 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 LONGEST_LINE = 1024
-"""Maximum length of a line, in bytes."""
+"""Largest length of a line, bytes."""
 _MARK = b"*"
 
 
 class LineFormat(NamedTuple):
-    """Description of the lines of a serial device."""
+    """Layout of the lines of a serial device."""
 
     columns: Mapping[int, int]
-    """Column of each slot of the record; the first column is 0."""
+    """Column of each slot of the record. The first column has the number 0."""
     separator: bytes = b","
     prefix: bytes = b""
-    """First bytes of every line with measurements; the first column follows."""
+    """Beginning of every line with measurements. The first column follows it."""
     width: int | None = None
-    """Required number of columns; None accepts any number that includes all fields."""
+    """Required number of columns. None accepts any number that includes all fields."""
     checksum: Checksum | None = None
 
 
 class LineCodec:
-    """Decodes input in pieces of any size into records; never raises.
+    """Codec that converts byte strings of any size to records; it never raises.
 
     Parameters
     ----------
     form : LineFormat
-        Description of the lines.
+        Layout of the lines.
     """
 
     def __init__(self, form: LineFormat) -> None:
         self._form = form
         self.slots = tuple(sorted(form.columns))
-        """Slots of a record, in its order."""
+        """Slots of a record, in the order of its numbers."""
         self._columns = [form.columns[slot] for slot in self.slots]
         self._least = max(self._columns, default=-1) + 1
         self._compute = None if form.checksum is None else compile_checksum(form.checksum)
@@ -61,11 +61,11 @@ class LineCodec:
         self.fed = 0
         """Number of bytes fed so far."""
         self.messages = 0
-        """Lines so far, those with another prefix included."""
+        """Number of lines so far, including lines with another prefix."""
         self.skipped = 0
-        """Lines with another prefix so far."""
+        """Number of lines with another prefix so far."""
         self.checksum_failures = 0
-        """Lines with a wrong checksum so far."""
+        """Number of lines with a wrong checksum so far."""
 
     @property
     def discarded(self) -> int:
@@ -79,11 +79,11 @@ class LineCodec:
 
     @property
     def longest(self) -> int:
-        """Maximum length of a line, in bytes."""
+        """Largest length of a line, bytes."""
         return LONGEST_LINE
 
     def feed(self, data: bytes) -> list[TableItem]:
-        """Return the lines that `data` completed, in wire order; never raises."""
+        """Return the lines that `data` completes, in wire order; never raise."""
         found: list[TableItem] = []
         *lines, rest = (self._pending + data).split(b"\n")
         end = self.fed - len(self._pending)
@@ -93,12 +93,12 @@ class LineCodec:
             self._take(line, end, found)
         if len(rest) > LONGEST_LINE:
             self._run.add(len(rest), _ENDLESS, found)
-            rest, self._joined = b"", True  # its end is no line
+            rest, self._joined = b"", True  # the end of a truncated line is not a line
         self._pending = rest
         return found
 
     def flush(self) -> list[TableItem]:
-        """Discard an unfinished line."""
+        """Discard an incomplete line."""
         found: list[TableItem] = []
         if self._pending:
             self._run.add(len(self._pending), CUT_OFF, found)
@@ -107,7 +107,7 @@ class LineCodec:
         return found
 
     def _take(self, line: bytes, end: int, found: list[TableItem]) -> None:
-        """Append the content of `line` (without LF)."""
+        """Append the record or the corrupt bytes of `line` (without LF)."""
         joined, self._joined = self._joined, False
         values, reason = (None, _ENDLESS) if joined else self._read(line)
         if values is not None:
@@ -122,7 +122,7 @@ class LineCodec:
             self.skipped += 1
 
     def _read(self, line: bytes) -> tuple[tuple[float, ...] | None, str]:
-        """Return the record of a line, or None and a reason; empty if the line is to be skipped."""
+        """Return the record of a line, or None with a reason, which is empty for skipped lines."""
         form = self._form
         text = line.rstrip(b"\r")
         if not text or not text.startswith(form.prefix):
@@ -141,7 +141,7 @@ class LineCodec:
             values = tuple([float(cells[at]) for at in self._columns])
         except ValueError:
             return None, _NO_NUMBER
-        # Python would read 1_000 as a number
+        # Python would accept 1_000 as a number.
         return (None, _NO_NUMBER) if b"_" in text else (values, "")
 
     def _matches(self, text: bytes, digits: bytes) -> bool:
@@ -155,7 +155,7 @@ class LineCodec:
 
 
 def encode_line(form: LineFormat, values: Sequence[float]) -> bytes:
-    """Return the line of a record; columns without a slot are 0."""
+    """Return the line that contains a record; columns without a slot are 0."""
     count = form.width or max(form.columns.values()) + 1
     cells = [b"0"] * count
     for slot, value in zip(sorted(form.columns), values, strict=True):

@@ -1,4 +1,4 @@
-"""Output of the serial codecs of tables."""
+"""Messages that the serial codecs of tables return."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from jointfit_protocols.corrupt import CorruptBytes
 
 
 class TableMessage(NamedTuple):
-    """One sample as sent."""
+    """One sample, with its numbers as sent."""
 
     values: tuple[float, ...]
-    """Record of the sample: counts of binary frames, numbers of text lines."""
+    """Record of the sample: counts in binary frames, numbers in text lines."""
     data: bytes
-    """Length of the message on the wire, bytes."""
+    """Bytes of the message on the wire."""
     end: int
-    """Number of bytes fed to the codec up to and including the last byte of the message, for
-    back-dating of the message."""
+    """Number of bytes fed to the codec until the end of the message, for back-dating of the
+    message."""
 
     @property
     def size(self) -> int:
-        """Length on the wire, bytes."""
+        """Length of the message on the wire, bytes."""
         return len(self.data)
 
 

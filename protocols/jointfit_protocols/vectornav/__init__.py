@@ -1,4 +1,4 @@
-"""VectorNav over UART or USB: binary outputs and ASCII register messages in one stream."""
+"""Wire format of VectorNav over UART or USB: binary outputs and ASCII messages in one stream."""
 
 from jointfit_protocols.vectornav._framing import (
     MAX_MESSAGE,

@@ -1,14 +1,14 @@
-"""Messages of VectorNav devices on a serial line: binary outputs among ASCII messages.
+"""Messages of VectorNav devices on a serial line: a mixture of binary outputs and ASCII messages.
 
     | FA | header | payload | CRC, high byte first |      header and payload: `_layout`
     | $ | content | * | checksum | CR LF |                `_text`
 
-The CRC has the polynomial 0x1021 and begins with 0. It covers header and payload. The length
-follows from the header.
+The CRC has the polynomial 0x1021 and the initial value 0. It includes header and payload. The
+header determines the length.
 
 Source: VN-100 user manual (UM001), section 5.
 
-Invariant: bytes in, messages out; no port, no clock.
+Invariant: the codec converts bytes to messages. It uses no port and no clock.
 """
 
 from __future__ import annotations
@@ -48,36 +48,35 @@ _START = re.compile(rb"[\xfa$]")
 _NO_START = CorruptBytes(1, NO_START)
 _CHECKSUM = CorruptBytes(1, CHECKSUM)
 UNKNOWN_HEADER = "header unknown to this version"
-"""Reason for the bytes of a binary output without a known layout."""
+"""Reason for the bytes of a binary output whose layout is not known."""
 _HEADER = CorruptBytes(1, UNKNOWN_HEADER)
 _TEXT = CorruptBytes(1, "malformed text")
 
 
 class BinaryPacket(NamedTuple):
-    """One binary output with a valid CRC."""
+    """One binary output whose CRC is correct."""
 
     layout: BinaryLayout
     values: tuple[Any, ...]
-    """Values of all fields; `BinaryLayout.places` has their places."""
+    """Values of all fields. `BinaryLayout.places` contains their indices."""
     size: int
-    """Length on the wire, bytes."""
+    """Length of the message on the wire, bytes."""
     end: int = 0
-    """Number of bytes fed to the codec up to and including the CRC, for back-dating of the
-    message."""
+    """Number of bytes fed to the codec until the end of the CRC, for back-dating of the message."""
 
 
 VectorNavMessage = BinaryPacket | TextMessage
 
 
 def encode_binary(values: Mapping[int, tuple[Any, ...]]) -> bytes:
-    """Return the binary output with these fields on the wire.
+    """Return the bytes of a binary output with these fields on the wire.
 
     Raises
     ------
     KeyError
         The size of a field is unknown.
     struct.error
-        The values do not fit.
+        The values do not fit the field.
     """
     layout = BinaryLayout(values)
     flat = [value for field in layout.fields for value in values[field]]
@@ -86,7 +85,7 @@ def encode_binary(values: Mapping[int, tuple[Any, ...]]) -> bytes:
 
 
 def _read_message(buffer: bytes, at: int, base: int) -> VectorNavMessage | CorruptBytes | None:
-    """Return the message that begins at `at`, the reason why none does, or None if it is cut."""
+    """Return the message at `at`, the reason why there is none, or None if it is incomplete."""
     if buffer[at] != SYNC:
         return _text(buffer, at, base) if buffer[at] == START[0] else _NO_START
 
@@ -100,7 +99,7 @@ def _read_message(buffer: bytes, at: int, base: int) -> VectorNavMessage | Corru
     if len(buffer) - at < size:
         return None
 
-    # The CRC of a body with its own CRC behind it is 0.
+    # The CRC of a body followed by its own CRC is 0.
     if crc_hqx(buffer[at + 1 : at + size], 0) != 0:
         return _CHECKSUM
     values = layout.struct.unpack_from(buffer, at + 1 + head)
@@ -108,7 +107,7 @@ def _read_message(buffer: bytes, at: int, base: int) -> VectorNavMessage | Corru
 
 
 def _text(buffer: bytes, at: int, base: int) -> TextMessage | CorruptBytes | None:
-    """Return the text that starts at `at`, the reason why none does, or None if it is cut."""
+    """Return the text at `at`, the reason why there is none, or None if it is incomplete."""
     after = buffer.find(END, at, at + MAX_TEXT)
     if after >= 0:
         after += len(END)
@@ -120,9 +119,9 @@ def _text(buffer: bytes, at: int, base: int) -> TextMessage | CorruptBytes | Non
 
 
 class VectorNavCodec(ResynchronizingCodec[VectorNavMessage]):
-    """Decoder of pieces of any size to messages; the result does not depend on the pieces.
+    """Codec that converts byte strings of any size to messages; their boundaries do not matter.
 
-    Runs of corrupt bytes are reported at the latest every `MAX_MESSAGE` bytes.
+    Runs of corrupt bytes are reported after at most `MAX_MESSAGE` bytes.
     """
 
     def __init__(self) -> None:

@@ -2,14 +2,15 @@
 
     | groups U1 | fields of group 1, U2 | fields of group 2, U2 | ... | payload |
 
-Bit k of ``groups`` announces group k + 1, bit k of the fields of a group announces its field k.
-The payload contains the announced fields in ascending order, little-endian, without padding.
-Firmware from 2023 on extends both: after a byte of groups with bit 7, a second byte announces the
-groups from 9 on; after a word of fields with bit 15, a second word announces the fields from 16 on.
-This module has no layout for a header with a field of unknown or variable size.
+Bit k of ``groups`` announces the group k + 1. Bit k in the fields of a group announces the field k
+of this group. The payload contains the announced fields in ascending order, little-endian and
+without padding. Firmware since 2023 extends both. If bit 7 of the byte of groups is set, a second
+byte announces the groups from 9 on. If bit 15 of a word of fields is set, a second word announces
+the fields from 16 on. This module has no layout for a header with a field of unknown or variable
+size.
 
-Sources: VN-100 user manual (UM001), section 5, "binary output messages"; the vendor's programming
-libraries (MIT), for the sizes of fields and the extensions (SDK 0.99).
+Sources: VN-100 user manual (UM001), section 5, "binary output messages". The sizes of fields and
+the extensions are from the vendor's programming libraries (MIT; SDK 0.99).
 """
 
 from __future__ import annotations
@@ -23,35 +24,35 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
 Fields = tuple[int, ...]
-"""Fields of an output, each ``group << 8 | bit``, group from 0, in ascending order."""
+"""Fields of an output in ascending order, each ``group << 8 | bit`` with groups counted from 0."""
 _GROUP_BITS = 8
 _MORE_GROUPS = 0x80
-"""Bit of a byte of groups after which a second one follows."""
+"""Bit in a byte of groups that announces a second byte of groups."""
 _MORE_FIELDS = 0x8000
-"""Bit of a word of fields after which a second one follows."""
+"""Bit in a word of fields that announces a second word of fields."""
 
 
 class Field(IntEnum):
-    """Fields that are decoded, each ``group << 8 | bit``."""
+    """Fields that can be decoded, each ``group << 8 | bit``."""
 
     TIME_STARTUP = 0x00
     """Time since power-up, ns."""
     YAW_PITCH_ROLL = 0x03
     """Yaw, pitch and roll, degrees."""
     QUATERNION = 0x04
-    """Quaternion x, y, z, w with the scalar last, from sensor to north-east-down."""
+    """Quaternion x, y, z, w with the scalar last, from sensor to a north-east-down world."""
     ANGULAR_RATE = 0x05
     """Compensated angular rate, rad/s."""
     ACCELERATION = 0x08
     """Compensated specific force, m/s^2."""
     MAGNETIC_AND_PRESSURE = 0x0A
-    """Compensated field, gauss, three values; temperature, C; pressure, kPa."""
+    """Compensated magnetic field, gauss, three values; temperature, °C; pressure, kPa."""
     TIME_GROUP_STARTUP = 0x100
     IMU_MAGNETIC_FIELD = 0x208
     IMU_ACCELERATION = 0x209
     IMU_ANGULAR_RATE = 0x20A
     ATTITUDE_STATUS = 0x400
-    """Bits 0 and 1: quality of the attitude, 0 excellent to 3 not tracking."""
+    """Bits 0 and 1: quality of the attitude, from 0 (excellent) to 3 (not tracking)."""
     ATTITUDE_QUATERNION = 0x402
 
 
@@ -76,13 +77,13 @@ _FORMATS: dict[int, dict[int, str]] = {
 """Struct codes of the fields of each group: common, time, IMU, GNSS, attitude, INS, GNSS 2 and 3.
 """
 MAX_PAYLOAD = sum(struct.calcsize("<" + x) for group in _FORMATS.values() for x in group.values())
-"""Size of a payload with all fields, bytes."""
+"""Size of a payload that contains all fields, bytes."""
 MAX_HEADER = 2 + 2 * (len(_FORMATS) + sum(max(group) > 15 for group in _FORMATS.values()))  # noqa: PLR2004 - bits of a word
-"""Size of the header of an output with all fields, bytes."""
+"""Size of the header of an output that contains all fields, bytes."""
 
 
 class BinaryLayout:
-    """Places of the fields in the payload of one kind of output.
+    """Indices of the fields in the payload of one type of output.
 
     Parameters
     ----------
@@ -102,7 +103,7 @@ class BinaryLayout:
         masks: dict[int, int] = {}
         written, at = "<", 0
         self.places: dict[int, slice] = {}
-        """Place of each field among the values of the payload."""
+        """Index of each field among the values of the payload."""
 
         for field in self.fields:
             group, bit = divmod(field, 1 << _GROUP_BITS)
@@ -117,11 +118,11 @@ class BinaryLayout:
 
         self.struct = struct.Struct(written)
         self.header = header_of(masks)
-        """Number of bytes from ``groups`` to the payload."""
+        """Number of bytes from ``groups`` to the start of the payload."""
 
 
 def header_of(masks: Mapping[int, int]) -> bytes:
-    """Return the header of an output whose groups, from 0, have these fields."""
+    """Return the header of an output with these groups, counted from 0, and their fields."""
     groups = sum(1 << group for group in masks)
     more = groups >> 8
     header = bytes((groups & 0x7F | _MORE_GROUPS, more) if more else (groups,))
@@ -133,7 +134,7 @@ def header_of(masks: Mapping[int, int]) -> bytes:
 
 
 def header_bytes(buffer: bytes, at: int) -> int | None:
-    """Return the size of the header at `at`; 0 if it has no known layout, None if it is cut."""
+    """Return the size of the header at `at`; 0 for an unknown layout, None if it is cut off."""
     end = len(buffer)
     if at >= end:
         return None
@@ -158,7 +159,7 @@ _KNOWN_GROUPS = sum(1 << group for group in _FORMATS)
 
 @lru_cache(maxsize=64)
 def layout_of(header: bytes) -> BinaryLayout | None:
-    """Return the layout that a header of the right size describes; None if it is unknown."""
+    """Return the layout that a complete header describes; None if it is unknown."""
     groups, at = header[0] & 0x7F, 1
     if header[0] & _MORE_GROUPS:
         groups, at = groups | header[1] << 8, 2

@@ -6,8 +6,8 @@
     $VNWNV*57               store all registers
     $VNERR,07*XX            error instead of a reply
 
-The checksum is the exclusive or of the characters between ``$`` and ``*``, two hexadecimal digits,
-or their CRC-16, four digits.
+The checksum is the exclusive or of the characters between ``$`` and ``*`` (two hexadecimal digits),
+or their CRC-16 (four digits).
 
 Source: VN-100 user manual (UM001), sections 3 to 6.
 """
@@ -23,11 +23,11 @@ from typing import NamedTuple
 
 START, END = b"$", b"\r\n"
 MAX_TEXT = 512
-"""Longest message, bytes; messages in the manual have up to 200 bytes."""
+"""Longest message, bytes. The messages in the manual have up to 200 bytes."""
 _TEXT = re.compile(rb"\$(VN[A-Z]{3}[ -)+-~]*)\*([0-9A-Fa-f]{4}|[0-9A-Fa-f]{2})\r\n")
-"""A whole message; its content has printable characters except the asterisk."""
+"""Pattern of a complete message. Its content has printable characters except the asterisk."""
 PLAUSIBLE = re.compile(rb"\$(V(N[ -~]*(\r(\n)?)?)?)?")
-"""Beginning of a message."""
+"""Pattern of the beginning of a message."""
 
 ERRORS = {
     1: "hard fault",
@@ -47,29 +47,30 @@ ERRORS = {
 
 
 class TextMessage(NamedTuple):
-    """One ASCII message with a valid checksum."""
+    """One ASCII message whose checksum is correct."""
 
     command: str
     """Name of the command, such as ``VNRRG``."""
     values: tuple[str, ...]
-    """Values behind the command."""
+    """Values that follow the command."""
     size: int
-    """Length on the wire, bytes."""
+    """Length of the message on the wire, bytes."""
     end: int = 0
-    """Number of bytes fed to the codec up to and including the last byte of the message."""
+    """Number of bytes fed to the codec until the end of the message."""
 
     @property
     def register(self) -> int | None:
-        """Number of the register that a reply is about; None for other messages."""
+        """Number of the register that a reply refers to; None for other messages."""
         about = self.command in {"VNRRG", "VNWRG"} and self.values
         return int(self.values[0]) if about and self.values[0].isdecimal() else None
 
     @property
     def error(self) -> int | None:
-        """Code of an error, 0 if it is unknown; None for other messages."""
+        """Code of an error message, 0 if it is unknown; None for other messages."""
         if self.command != "VNERR" or not self.values:
             return None
-        # Hexadecimal by the vendor's library, decimal by some firmware: 0C and 12 are the same.
+        # The vendor's library reads the code as hexadecimal, but some firmware sends it as decimal:
+        # 0C or 12.
         for base in (16, 10):
             with suppress(ValueError):
                 code = int(self.values[0], base)
@@ -92,12 +93,12 @@ def decode_text(wire: bytes, end: int) -> TextMessage | None:
 
 
 def encode_text(content: str) -> bytes:
-    """Return a message, such as ``VNRRG,1``, on the wire.
+    """Return the bytes of a message, such as ``VNRRG,1``, on the wire.
 
     Raises
     ------
     ValueError
-        The content is no such message, or too long.
+        The content is not such a message, or is too long.
     """
     data = content.encode("ascii")
     wire = START + data + b"*%02X" % reduce(xor, data, 0) + END
@@ -107,5 +108,5 @@ def encode_text(content: str) -> bytes:
 
 
 def error_text(code: int) -> str:
-    """Return a description of an error."""
+    """Return the description of an error code."""
     return f"error {code}, {ERRORS.get(code, 'unknown to this version')}"

@@ -5,11 +5,11 @@
 | 1, 3, 4  | model, serial number, firmware version                                        |
 | 5        | baud rate of the port                                                         |
 | 6        | type of the asynchronous ASCII output; 0: off                                 |
-| 7        | its rate, Hz                                                                  |
+| 7        | rate of the asynchronous ASCII output, Hz                                     |
 | 26       | reference frame rotation, 3 x 3, row by row: sensor to body axes              |
 | 75 to 77 | binary outputs 1 to 3: ports, divisor, groups, fields of each group           |
 
-Writes last until power-down, unless the command VNWNV stores all registers.
+Written values are valid until power-down, unless the command VNWNV stores all registers.
 
 Source: VN-100 user manual (UM001), section 6.
 """
@@ -42,12 +42,13 @@ class Register(IntEnum):
 
 
 BOTH_PORTS = 3
-"""Ports of a binary output: 0 no port, 1 the first port, 2 the second port, 3 both ports."""
+"""Value that selects both ports of a binary output. 0 is no port, 1 the first, 2 the second
+port."""
 _MATRIX_VALUES = 9
 
 
 class BinaryOutput(NamedTuple):
-    """Content of a register of binary outputs."""
+    """Content of a register that configures a binary output."""
 
     ports: int
     divisor: int

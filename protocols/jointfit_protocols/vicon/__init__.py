@@ -1,4 +1,4 @@
-"""Codec of the Vicon DataStream protocol, little-endian over TCP."""
+"""Codec of the protocol DataStream of Vicon, little-endian over TCP."""
 
 from jointfit_protocols.vicon._messages import (
     DYNAMIC,

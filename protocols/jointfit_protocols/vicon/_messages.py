@@ -1,9 +1,11 @@
 """Objects of the Vicon DataStream: ``u32 id, u32 length, body``.
 
-A string is a u32 length and bytes, a vector or a set a u32 count and items, a map a u32 count and
-pairs. Positions are millimetres, rotations row-major, segment to world.
+A string is a u32 length, followed by bytes. A vector or a set is a u32 count, followed by items. A
+map is a u32 count, followed by pairs. Positions are in millimetres. Rotation matrices are in
+row-major order, from segment to world.
 
-*Static* objects describe subjects and are sent after a change; *dynamic* ones belong to a frame.
+*Static* objects describe subjects, and are sent after a change. *Dynamic* objects belong to a
+frame.
 """
 
 from __future__ import annotations
@@ -13,17 +15,17 @@ from struct import Struct
 from typing import NamedTuple
 
 HEADER = Struct("<II")
-"""Id and length of a packet or object."""
+"""Layout of the header of a packet or object: id and length."""
 PACKET = 0x1A2B0001
-"""Id of a packet."""
+"""Id that marks a packet."""
 LARGEST_PACKET = 16 << 20
 """Largest accepted packet, bytes."""
 TICKS_PER_S = 135_000_000
-"""Unit of the frame period, 1/s."""
+"""Number of ticks per second in which the frame period is given."""
 
 
 class ObjectId(IntEnum):
-    """Ids of the objects that are read."""
+    """Ids of the objects whose content is read."""
 
     STREAM_INFO = 1
     SUBJECT_INFO = 2
@@ -46,25 +48,25 @@ class ObjectId(IntEnum):
 
 
 STATIC = frozenset((1, 2, 28, 29, 37, 40, 28_001))
-"""Ids of the objects that describe subjects and stream."""
+"""Ids of the objects that describe the subjects and the stream."""
 DYNAMIC = frozenset((5, 6, 7, 8, 9, 23, 26, 36, 39, 901))
 """Ids of the objects that belong to one frame."""
 REQUESTS = frozenset((100_005, 100_006, 100_007, 100_008))
-"""Ids of the requests of a client that this project does not send."""
+"""Ids of client requests that this project does not send."""
 
 
 class StreamInfo(NamedTuple):
     """Period of the frames."""
 
     period: int
-    """Ticks of `TICKS_PER_S`."""
+    """Frame period in ticks of 1 / `TICKS_PER_S`."""
 
 
 class SegmentInfo(NamedTuple):
     """One segment of a subject."""
 
     parent: int
-    """Id of its parent; 0 for the root."""
+    """Id of the parent segment; 0 for the root."""
     id: int
     name: str
 
@@ -84,11 +86,11 @@ class SubjectInfo(NamedTuple):
     segments: tuple[SegmentInfo, ...]
     markers: tuple[MarkerInfo, ...]
     attachments: tuple[tuple[int, int], ...] = ()
-    """Marker and segment to which it is attached."""
+    """Pairs of a marker and the segment to which it is attached."""
 
 
 class FrameInfo(NamedTuple):
-    """Number of the frame, from 0."""
+    """Number of the frame, counted from 0."""
 
     number: int
 
@@ -105,7 +107,7 @@ class LabeledRecon(NamedTuple):
 
 
 class LabeledRecons(NamedTuple):
-    """Positions of the labeled markers that are seen, mm."""
+    """Positions of all visible labeled markers, mm."""
 
     recons: tuple[LabeledRecon, ...]
 
@@ -117,11 +119,11 @@ class SegmentPose(NamedTuple):
     position: tuple[float, float, float]
     """Position, mm."""
     rotation: tuple[float, ...]
-    """Nine numbers by rows."""
+    """Nine elements of the rotation matrix, by rows."""
 
 
 class Segments(NamedTuple):
-    """Poses of the segments of one subject; a subject that is not seen has no such object."""
+    """Poses of all segments of one subject. A subject that is not visible has no such object."""
 
     id: int
     """`ObjectId.GLOBAL_SEGMENTS`, or ``LOCAL_SEGMENTS`` for poses relative to the parent."""
@@ -130,7 +132,7 @@ class Segments(NamedTuple):
 
 
 class LightSegment(NamedTuple):
-    """Pose of one segment relative to its parent: mm, rotation vector in rad."""
+    """Pose of one segment relative to its parent: position in mm, rotation vector in rad."""
 
     segment: int
     x: float
@@ -142,7 +144,7 @@ class LightSegment(NamedTuple):
 
 
 class LightSegments(NamedTuple):
-    """Poses of the segments of one subject in 32-bit numbers."""
+    """Poses of all segments of one subject, in 32-bit numbers."""
 
     subject: int
     segments: tuple[LightSegment, ...]
@@ -158,14 +160,14 @@ class StreamTimecode(NamedTuple):
     subframes: int
     subframes_per_frame: int
     standard: int
-    """Video standard: 0 PAL, 1 NTSC, 2 drop frame, 3 film, 4 NTSC film, 5 ATSC; 0xFFFFFFFF:
+    """Video standard: 0 PAL, 1 NTSC, 2 drop frame, 3 film, 4 NTSC film, 5 ATSC. 0xFFFFFFFF means
     none."""
     user_bits: int = 0
     field: int = 0
 
 
 class LatencyInfo(NamedTuple):
-    """Stages of processing, each with its duration, s."""
+    """Processing stages, each with its duration, s."""
 
     stages: tuple[tuple[str, float], ...]
 
@@ -177,38 +179,38 @@ class HardwareFrame(NamedTuple):
 
 
 class ApplicationInfo(NamedTuple):
-    """Orientation of the world: 0 z up, 1 y up."""
+    """Vertical axis of the world: 0 z up, 1 y up."""
 
     orientation: int
 
 
 class FrameRates(NamedTuple):
-    """Rates by name, Hz."""
+    """Frame rates by name, Hz."""
 
     rates: tuple[tuple[str, float], ...]
 
 
 class ObjectQuality(NamedTuple):
-    """Quality of the tracking of one subject, 0 to 1."""
+    """Quality of the tracking of one subject, from 0 to 1."""
 
     subject: int
     quality: float
 
 
 class ViconPing(NamedTuple):
-    """Question of a client, or the same object as its answer."""
+    """Ping from a client, or the same object as the server's answer."""
 
     number: int
 
 
 class ObjectEnums(NamedTuple):
-    """Ids that the server can send, or that the client wants."""
+    """Ids of objects that the server can send, or that the client requests."""
 
     ids: frozenset[int]
 
 
 class RequestFrame(NamedTuple):
-    """Request of one frame, or of all."""
+    """Request for one frame or for all frames."""
 
     stream: bool
 
@@ -218,15 +220,15 @@ class KeepAlive(NamedTuple):
 
 
 class Contents(NamedTuple):
-    """Ids of the frame's objects, and ids of those that are unchanged."""
+    """Ids of the objects in the frame, and ids of unchanged objects."""
 
     present: tuple[tuple[int, int], ...]
-    """Id and number of objects."""
+    """Id and number of the objects of each type."""
     unchanged: frozenset[int]
 
 
 class OpaqueObject(NamedTuple):
-    """An object that is not read."""
+    """An object whose content is not read."""
 
     id: int
     data: bytes

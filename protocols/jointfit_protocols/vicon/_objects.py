@@ -1,8 +1,8 @@
-"""Bodies of the objects of the Vicon DataStream, both directions.
+"""Bodies of the objects of the Vicon DataStream, in both directions.
 
-Invariant: a count or length is compared with the bytes left before anything is read, so that time
-and memory are linear in the body. Bytes after a known body are ignored: newer servers append
-fields.
+Invariant: a count or length is compared with the number of remaining bytes before anything is read.
+Time and memory are therefore proportional to the size of the body. Bytes after the known content of
+a body are ignored, because newer servers append fields.
 """
 
 from __future__ import annotations
@@ -56,30 +56,30 @@ _QUALITY = Struct("<Id")
 _F64 = Struct("<d")
 _NO_COVARIANCE = (0.0,) * 9
 _EMPTY_STRING = 4
-"""Length of a string without text, bytes."""
+"""Length of an empty string, bytes."""
 
 OPTIONAL = frozenset((
     ObjectId.STREAM_INFO, ObjectId.TIMECODE, ObjectId.LATENCY_INFO, ObjectId.HARDWARE_FRAME,
     ObjectId.APPLICATION_INFO, ObjectId.FRAME_RATES, ObjectId.OBJECT_QUALITY, ObjectId.PING,
     ObjectId.SUBJECT_INFO,
 ))  # fmt: skip
-"""Objects without which poses or markers of other subjects are known: servers of other versions may
-lack a part."""
+"""Objects that are not necessary to know poses or markers. Servers of other versions may send only
+a part of such an object."""
 
 
 class _BodyError(Exception):
-    """A body ends before its content; does not leave this module."""
+    """A body ends before its content is complete. The exception does not leave this module."""
 
 
 class _Cursor:
-    """Place in a body."""
+    """Reading position in a body."""
 
     def __init__(self, data: memoryview) -> None:
         self._data = data
         self._at = 0
 
     def take(self, layout: Struct) -> tuple[int | float, ...]:
-        """Return the numbers of a layout."""
+        """Read the numbers of a layout."""
         if layout.size > self._left:
             raise _BodyError(f"{layout.size} bytes needed, {self._left} left")
         found = layout.unpack_from(self._data, self._at)
@@ -87,24 +87,24 @@ class _Cursor:
         return found
 
     def integer(self, layout: Struct = _U32) -> int:
-        """Return one integer."""
+        """Read one integer."""
         return int(self.take(layout)[0])
 
     def count(self, least: int) -> int:
-        """Return a count of items that have at least `least` bytes each."""
+        """Read the number of items that have at least `least` bytes each."""
         found = self.integer()
         if found * least > self._left:
             raise _BodyError(f"{found} items in {self._left} bytes")
         return found
 
     def items(self, layout: Struct) -> Iterable[tuple[int | float, ...]]:
-        """Return the items of a vector of fixed layout."""
+        """Read the items of a vector with a fixed layout."""
         size = self.count(layout.size) * layout.size
         begin, self._at = self._at, self._at + size
         return layout.iter_unpack(self._data[begin : self._at])
 
     def text(self) -> str:
-        """Return a string, cut after `_LONGEST_NAME` bytes."""
+        """Read a string, truncated after `_LONGEST_NAME` bytes."""
         size = self.count(1)
         begin, self._at = self._at, self._at + size
         raw = bytes(self._data[begin : min(self._at, begin + _LONGEST_NAME)])
@@ -121,9 +121,9 @@ class _Cursor:
 
 
 def decode_object(kind: int, data: memoryview) -> Object | str:
-    """Return the object with an id, or the reason for which its body is corrupt.
+    """Return the object with an id, or the reason why its body is corrupt.
 
-    An optional object with a shorter body than known is opaque.
+    An optional object whose body is shorter than known becomes an `OpaqueObject`.
     """
     read = _READERS.get(kind)
     if read is None:
@@ -145,7 +145,7 @@ def _subject(cursor: _Cursor) -> SubjectInfo:
     for _ in range(cursor.count(_SEGMENT_INFO.size + _EMPTY_STRING)):
         parent, segment = cursor.take(_SEGMENT_INFO)
         segments.append(SegmentInfo(int(parent), int(segment), cursor.text()))
-    # Servers of other versions end the object before the markers or before their attachments.
+    # Servers of other versions may omit the markers, or the attachments of markers, at the end.
     markers = [
         MarkerInfo(cursor.integer(), cursor.text())
         for _ in range(0 if cursor.ended else cursor.count(_U32.size + _EMPTY_STRING))

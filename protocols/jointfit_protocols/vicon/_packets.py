@@ -1,4 +1,4 @@
-"""Packets of the Vicon DataStream: ``u32 0x1A2B0001, u32 length``, and objects.
+"""Packets of the Vicon DataStream: ``u32 0x1A2B0001, u32 length``, followed by objects.
 
 Invariant: `decode` never raises.
 """
@@ -14,13 +14,13 @@ from jointfit_protocols.vicon._objects import decode_object, encode_object
 
 
 class Packet(NamedTuple):
-    """One packet."""
+    """One packet of the stream."""
 
     objects: tuple[Object, ...]
 
 
 def decode(packet: bytes) -> Packet | CorruptBytes:
-    """Return the content of one whole packet; never raises."""
+    """Return the content of one complete packet; never raise."""
     size = len(packet)
     if size < HEADER.size:
         return CorruptBytes(size, "shorter than a packet header")
@@ -35,7 +35,7 @@ def decode(packet: bytes) -> Packet | CorruptBytes:
 
 
 def _decode_objects(packet: bytes) -> tuple[Object, ...] | str:
-    """Return the objects of a packet, or the reason for which they are corrupt."""
+    """Return the objects of a packet, or the reason why they are corrupt."""
     view, size, at = memoryview(packet), len(packet), HEADER.size
     objects = []
     while at < size:
@@ -54,7 +54,7 @@ def _decode_objects(packet: bytes) -> tuple[Object, ...] | str:
 
 
 def encode(*objects: Object) -> bytes:
-    """Return a packet with these objects."""
+    """Return a packet that contains these objects."""
     bodies = map(encode_object, objects)
     data = b"".join(HEADER.pack(kind, len(body)) + body for kind, body in bodies)
     return HEADER.pack(PACKET, len(data)) + data

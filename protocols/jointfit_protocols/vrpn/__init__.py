@@ -1,4 +1,4 @@
-"""VRPN, versions 07.xx: tracker messages over TCP and UDP, in both directions."""
+"""Wire format of VRPN 07.xx: tracker messages over TCP and UDP, in both directions."""
 
 from jointfit_protocols.vrpn._codec import COOKIE_BYTES, VrpnCodec, is_whole, whole_messages
 from jointfit_protocols.vrpn._encode import encode, encode_announcement

@@ -1,11 +1,12 @@
-"""Decoder of a VRPN byte stream: cookie, messages and descriptions of types.
+"""Codec of a VRPN byte stream: cookie, messages, and descriptions of senders and types.
 
-A datagram contains whole messages, so that the bytes of datagrams may be fed between whole messages
-of a TCP connection. A message has no start pattern and no checksum. After an impossible length,
-everything up to the next cookie is discarded; a driver closes the connection.
+A datagram contains complete messages. The bytes of datagrams may therefore be fed between complete
+messages of a TCP connection. A message has no start pattern and no checksum. After an impossible
+length, everything up to the next cookie is discarded, and a driver closes the connection.
 
-Invariant: bytes in, messages out; no socket, no clock. The output does not depend on the pieces.
-Pending bytes are at most one message, descriptions at most `MAX_IDS` of each kind.
+Invariant: the codec converts bytes to messages. It uses no socket and no clock, and the boundaries
+of the byte strings do not matter. At most one incomplete message is stored, and at most `MAX_IDS`
+descriptions of each kind.
 """
 
 from __future__ import annotations
@@ -45,13 +46,13 @@ COOKIE_BYTES = 24
 HEADER_BYTES = HEADER.size
 _MAGIC = b"vrpn: ver. "
 _COOKIE = re.compile(rb"vrpn: ver\. (\d\d)\.(\d\d)  ([0-3])\0.{4}", re.DOTALL)
-"""The reference implementation does not initialize the last four bytes."""
+"""Pattern of a cookie. The reference implementation does not initialize the last four bytes."""
 _FIRST = int.from_bytes(_MAGIC[:4], "big")
-"""Length field that the first bytes of a cookie look like."""
+"""Value of the first bytes of a cookie if they are read as a length field."""
 _US = 1_000_000
 _POSE_BYTES = HEADER_BYTES + POSE_LAYOUT.size
 _RUN = 4096
-"""Number of bytes without a message after which these bytes are reported."""
+"""Number of bytes without a message after which they are reported."""
 
 
 class _Kind(IntEnum):
@@ -72,15 +73,15 @@ _KINDS = {
 
 
 class VrpnCodec:
-    """Decoder of one side of a connection.
+    """Codec for one direction of a connection.
 
-    A cookie starts a new connection: the descriptions of the last one are discarded.
+    A cookie starts a new connection, and the descriptions of the last connection are discarded.
     """
 
     def __init__(self) -> None:
         self._buffer = bytearray()
         self._needed = HEADER_BYTES
-        """Number of bytes in the buffer at which the next message can be decoded."""
+        """Number of buffered bytes at which the next message can be decoded."""
         self._lost = False
         self._run = 0
         self._kinds: dict[int, _Kind] = {}
@@ -89,7 +90,7 @@ class VrpnCodec:
         self.types: dict[int, str] = {}
         """Names of the message types that the peer has described."""
         self.messages = 0
-        """Messages so far; cookies count."""
+        """Number of messages so far, including cookies."""
         self.discarded = 0
         """Number of bytes so far that belong to no message."""
 
@@ -100,7 +101,7 @@ class VrpnCodec:
 
     @property
     def lost(self) -> bool:
-        """Whether the stream cannot be decoded before the next cookie."""
+        """Whether the stream cannot be decoded until the next cookie."""
         return self._lost
 
     def feed(self, data: bytes) -> list[VrpnContent | CorruptBytes]:
@@ -131,7 +132,7 @@ class VrpnCodec:
             if end - at < size:
                 self._needed = size
                 break
-            # The common case first: it is nearly the whole stream.
+            # This case is tested first, because poses are nearly the whole stream.
             if length == _POSE_BYTES and kinds.get(kind) is _Kind.POSE and micros < _US:
                 sensor, x, y, z, qx, qy, qz, qw = unpack_pose(buffer, at + HEADER_BYTES)
                 found.append(
@@ -153,7 +154,7 @@ class VrpnCodec:
         return found
 
     def flush(self) -> list[CorruptBytes]:
-        """Discard an incomplete message: the connection is closed."""
+        """Discard an incomplete message, because the connection is closed."""
         pending = len(self._buffer) + self._run
         self.discarded += len(self._buffer)
         self._buffer.clear()
@@ -163,7 +164,7 @@ class VrpnCodec:
     # --- connection ---------------------------------------------------------------------------
 
     def _seek_cookie(self, at: int, found: list[VrpnContent | CorruptBytes]) -> int:
-        """Return the start of the next cookie, or of bytes that may be one; count those before."""
+        """Return the start of the next (possible) cookie, and count the bytes before it."""
         start = self._buffer.find(_MAGIC, at)
         if start >= 0:
             self._lost = False
@@ -179,7 +180,7 @@ class VrpnCodec:
         return start
 
     def _cookie(self, at: int, found: list[VrpnContent | CorruptBytes]) -> int:
-        """Append the cookie at `at` and forget the peer before; return the place after it."""
+        """Append the cookie at `at`, discard the previous peer; return the position after it."""
         match = _COOKIE.fullmatch(self._buffer, at, at + COOKIE_BYTES)
         if match is None:
             self.discarded += 1
@@ -198,7 +199,7 @@ class VrpnCodec:
     def _content(  # noqa: PLR0911 - one case a type
         self, seconds: int, micros: int, sender: int, kind: int, body: bytes
     ) -> VrpnContent | str:
-        """Return one message, or the reason why it is rejected."""
+        """Return the content of one message, or the reason why it is rejected."""
         if kind < 0:
             return self._system(seconds * _US + micros, sender, kind, body)
         if micros >= _US:
@@ -251,9 +252,10 @@ class VrpnCodec:
 
 
 def whole_messages(data: bytes) -> int:
-    """Return the bytes of `data` up to the end of its last whole message or cookie.
+    """Return the number of bytes of `data` up to the end of its last complete message or cookie.
 
-    Decodes no content. An impossible length counts as the end of the data: the codec rejects it.
+    The function decodes no content. An impossible length counts as the end of the data, because the
+    codec rejects it.
     """
     at, end = 0, len(data)
     while end - at >= HEADER_BYTES:
@@ -271,7 +273,7 @@ def whole_messages(data: bytes) -> int:
 
 
 def is_whole(datagram: bytes) -> bool:
-    """Return whether a datagram consists of whole messages; a cookie is none."""
+    """Return whether a datagram consists of complete messages. A cookie is not a message."""
     at, end = 0, len(datagram)
     while end - at >= HEADER_BYTES:
         length = int.from_bytes(datagram[at : at + 4], "big")

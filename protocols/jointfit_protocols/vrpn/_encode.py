@@ -41,23 +41,24 @@ def encode(
     sequence: int = 0,
     time_us: int = 0,
 ) -> bytes:
-    """Return a message on the wire, padding included.
+    """Return the bytes of a message on the wire, including padding.
 
     Parameters
     ----------
     message : VrpnContent
-        The message.
+        Message to encode.
     types : mapping of str to int, optional
-        Numbers by which this side has described its types; needed for tracker and heartbeat.
+        Numbers by which this side has described its types. Tracker and heartbeat messages need
+        them.
     sequence : int
-        Number of the message in this connection.
+        Sequence number of the message in this connection.
     time_us : int
-        Time in the header of messages without a time of their own, µs since 1970.
+        Time for the header of messages that contain no time, µs since 1970.
 
     Raises
     ------
     ValueError
-        The message is longer than 64 000 bytes.
+        The message has more than 64 000 bytes.
     KeyError
         The type of the message is not in `types`.
     """
@@ -75,16 +76,16 @@ def encode(
 
 
 def encode_announcement(announcement: Announcement) -> bytes:
-    """Return the datagram with which a client asks the server to connect back."""
+    """Return the datagram with which a client requests the server to connect back."""
     return f"{announcement.host} {announcement.port}\0".encode()
 
 
 def _parts(  # noqa: PLR0911 - one case a type
     message: VrpnContent, types: Mapping[str, int]
 ) -> tuple[int, int, bytes]:
-    """Return sender, type and body."""
+    """Return sender, type and body of a message."""
     match message:
-        # The reference implementation repeats the sensor in place of padding.
+        # The reference implementation repeats the sensor number instead of padding.
         case TrackerPose():
             body = POSE_LAYOUT.pack(*message[2:])
             return message.sender, types[POS_QUAT], body[:4] + body[:4] + body[8:]

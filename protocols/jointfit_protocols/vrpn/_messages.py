@@ -1,10 +1,10 @@
-"""Messages of VRPN 07.xx, big-endian, equal over TCP and UDP.
+"""Messages of VRPN 07.xx, big-endian, which are the same over TCP and UDP.
 
      0        4         8              12       16     20         24     24+n
     | length | seconds | microseconds | sender | type | sequence | body | zeros up to 8 bytes |
 
-`length` is 24 + n, without padding. Negative types belong to the connection; all others are
-numbered by the peer, which describes each number by a name.
+`length` is 24 + n, without the padding. Negative types belong to the connection. The peer numbers
+all other types, and describes each number by a name.
 
 | type | body |
 |---|---|
@@ -28,17 +28,18 @@ from typing import NamedTuple
 from jointfit_protocols.corrupt import CorruptBytes
 
 DEFAULT_PORT = 3883
-"""TCP and UDP port of servers."""
+"""Default TCP and UDP port of servers."""
 MAJOR = 7
 MINOR = 38
-"""Newest minor version whose messages are known."""
+"""Newest minor version whose messages are supported."""
 """Version that both sides must share; a different minor version is compatible."""
 MAX_MESSAGE = 64_000
-"""Maximum size of a message in bytes, the buffer of the reference implementation."""
+"""Largest size of a message, bytes, which is the buffer size of the reference implementation."""
 MAX_IDS = 2000
-"""Senders, and types, that a peer may describe: the limit of the reference implementation."""
+"""Largest number of senders, and of types, that a peer may describe, as in the reference
+implementation."""
 MAX_NAME = 255
-"""Maximum size of a name in bytes."""
+"""Largest size of a name, bytes."""
 LOWEST_PORT = 1024
 """Lowest port to which a server connects back."""
 
@@ -53,13 +54,13 @@ ACCELERATION = "vrpn_Tracker Acceleration"
 PING = "vrpn_Base ping_message"
 PONG = "vrpn_Base pong_message"
 TYPE_NAMES = (POS_QUAT, VELOCITY, ACCELERATION, PING, PONG)
-"""Names of the types that have a message class of their own."""
+"""Names of the types that have a separate message class."""
 
 _ANNOUNCED = re.compile(rb"([A-Za-z0-9.]{1,255}) ([0-9]{1,5})\0?")
 
 
 class SystemType(IntEnum):
-    """Types of the connection itself."""
+    """Types of messages that belong to the connection itself."""
 
     SENDER = -1
     TYPE = -2
@@ -69,13 +70,13 @@ class SystemType(IntEnum):
 
 
 class Cookie(NamedTuple):
-    """First 24 bytes of each side of a TCP connection."""
+    """First 24 bytes that each side of a TCP connection sends."""
 
     major: int = MAJOR
     minor: int = 38
     log_mode: int = 0
-    """Logging by the peer, 0 to 3: bit 0, it writes incoming messages to a file; bit 1, outgoing
-    ones."""
+    """Logging by the peer, 0 to 3. Bit 0: it writes incoming messages to a file. Bit 1: it writes
+    outgoing messages."""
 
 
 class SenderDescription(NamedTuple):
@@ -86,34 +87,34 @@ class SenderDescription(NamedTuple):
 
 
 class TypeDescription(NamedTuple):
-    """Name of a message type."""
+    """Name of a message type, with its number."""
 
     id: int
     name: str
 
 
 class UdpChannel(NamedTuple):
-    """Request to send messages without delivery guarantee to this UDP port."""
+    """Request to send messages that need no guaranteed delivery to this UDP port."""
 
     port: int
     host: str
 
 
 class Disconnect(NamedTuple):
-    """End of the connection."""
+    """Message that ends the connection."""
 
 
 class TrackerPose(NamedTuple):
     """Pose of one sensor of a tracker."""
 
     time_us: int
-    """Wall clock of the sender when the message was made, µs since 1970."""
+    """Clock of the sender when the message was created, µs since 1970."""
     sender: int
     sensor: int
     x: float
     y: float
     z: float
-    """Position, m by convention."""
+    """Position, in metres by convention."""
     qx: float
     qy: float
     qz: float
@@ -124,7 +125,7 @@ class TrackerMotion(NamedTuple):
     """Velocity or acceleration of one sensor of a tracker."""
 
     type: str
-    """`VELOCITY` or `ACCELERATION`."""
+    """Name of the type: `VELOCITY` or `ACCELERATION`."""
     time_us: int
     sender: int
     sensor: int
@@ -135,12 +136,12 @@ class TrackerMotion(NamedTuple):
     qy: float
     qz: float
     qw: float
-    """Rotation during `interval_s`, per second for an acceleration."""
+    """Rotation during `interval_s`; for an acceleration, its change per second."""
     interval_s: float
 
 
 class Ping(NamedTuple):
-    """Request for a `Pong` of the same sender."""
+    """Request for a `Pong` from the same sender."""
 
     time_us: int
     sender: int
@@ -154,7 +155,7 @@ class Pong(NamedTuple):
 
 
 class VrpnMessage(NamedTuple):
-    """Message without a class of its own."""
+    """Message that has no separate class."""
 
     time_us: int
     sender: int
@@ -177,18 +178,19 @@ VrpnContent = (
 
 
 class Announcement(NamedTuple):
-    """Datagram with which a client of a classic connection asks the server to connect back."""
+    """Datagram with which a client of a classic connection requests the server to connect back."""
 
     host: str
-    """Address as the client knows it; servers use the source address of the datagram."""
+    """Address of the client as the client knows it. Servers use the datagram's source address."""
     port: int
     """TCP port on which the client listens."""
 
 
 def decode_announcement(datagram: bytes) -> Announcement | CorruptBytes:
-    """Return the announcement in a datagram; never raises.
+    """Return the announcement in a datagram; never raise.
 
-    Like the reference implementation, it rejects ports below 1024 and hosts with characters other
+    In the same way as the reference implementation, the function rejects ports below 1024, and
+    hosts with characters other than letters, digits and dots.
     than letters, digits and dots.
     """
     found = _ANNOUNCED.fullmatch(datagram)

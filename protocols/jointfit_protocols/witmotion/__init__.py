@@ -1,4 +1,4 @@
-"""WitMotion 0x55 frames on a UART: framing, register commands and the content of frames."""
+"""Wire format of WitMotion 0x55 frames on a UART: framing, commands and content of frames."""
 
 from jointfit_protocols.witmotion._content import (
     FULL_SCALE,

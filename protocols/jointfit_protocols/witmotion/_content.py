@@ -9,7 +9,7 @@
 | 0x59            | quaternion w x y z                         | 1 / 32768                 |
 | 0x5F            | four registers                             |                           |
 
-Source: protocol pages of the vendor. g is 9.8 m/s^2 there.
+Source: protocol pages of the vendor, which use g = 9.8 m/s^2.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ import struct
 from math import radians
 
 FULL_SCALE = 32768
-"""Counts of 1 in a quaternion; identity is 32767."""
+"""Number of counts for 1 in a quaternion. The identity is sent as 32767."""
 TICK_NS = 1_000_000
 """Unit of the calendar time, ns."""
 G = 9.8
-"""Acceleration of gravity with which the vendor converts counts, m/s^2."""
+"""Acceleration of gravity that the vendor uses for the conversion of counts, m/s^2."""
 
 _COUNTS = struct.Struct("<4h")
 _REGISTERS = struct.Struct("<4H")
@@ -33,43 +33,43 @@ _RATE = radians(2000.0) / FULL_SCALE
 """Angular rate of one count, rad/s."""
 _MONTHS, _DAYS, _HOURS, _SIXTIETHS, _MILLISECONDS = 12, 31, 24, 60, 1000
 _YEAR_DAYS = (0, 31, 59, 90, 120, 151, 181, 212, 243, 273, 304, 334)
-"""Days of a year before each month, without the leap day."""
+"""Number of days in a year before each month, without the leap day."""
 _FEBRUARY = 2
 
 
 def counts_of(data: bytes) -> tuple[int, int, int, int]:
-    """Return the four int16 of a frame."""
+    """Return the four int16 numbers in the data of a frame."""
     w, x, y, z = _COUNTS.unpack(data)
     return w, x, y, z
 
 
 def encode_counts(counts: tuple[int, int, int, int]) -> bytes:
-    """Return the data of a frame with four int16; larger values are limited."""
+    """Return the data of a frame with four int16 numbers. Larger values are clipped."""
     return _COUNTS.pack(*(max(-FULL_SCALE, min(FULL_SCALE - 1, count)) for count in counts))
 
 
 def acceleration_of(data: bytes) -> tuple[float, float, float]:
-    """Return the specific force of a frame 0x51, m/s^2."""
+    """Return the specific force in a frame 0x51, m/s^2."""
     x, y, z, _ = _COUNTS.unpack(data)
     return _FORCE * x, _FORCE * y, _FORCE * z
 
 
 def rate_of(data: bytes) -> tuple[float, float, float]:
-    """Return the angular rate of a frame 0x52, rad/s."""
+    """Return the angular rate in a frame 0x52, rad/s."""
     x, y, z, _ = _COUNTS.unpack(data)
     return _RATE * x, _RATE * y, _RATE * z
 
 
 def registers_of(data: bytes) -> tuple[int, int, int, int]:
-    """Return the four registers of a frame 0x5F, from the requested register on."""
+    """Return the four registers in a frame 0x5F, beginning with the requested register."""
     a, b, c, d = _REGISTERS.unpack(data)
     return a, b, c, d
 
 
 def time_of(data: bytes) -> int | None:
-    """Return the time of a frame 0x50, ms since the start of 2000; None if it is not a time.
+    """Return the time in a frame 0x50, ms since the start of 2000; None if it is not a valid time.
 
-    Month and day 0 of a clock that was never set count as 1.
+    If a clock was never set, its month 0 and day 0 count as 1.
     """
     year, month, day, hour, minute, second, milli = _TIME.unpack(data)
     month, day = month or 1, day or 1
@@ -86,7 +86,7 @@ def time_of(data: bytes) -> int | None:
 
 
 def encode_time(ticks: int) -> bytes:
-    """Return the data of a frame 0x50 for a time in ms since the start of 2000, before 2100."""
+    """Return the data of a frame 0x50 for a time before 2100, ms since the start of 2000."""
     seconds, milli = divmod(ticks, 1000)
     minutes, second = divmod(seconds, 60)
     hours, minute = divmod(minutes, 60)

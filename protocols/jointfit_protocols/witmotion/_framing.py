@@ -3,12 +3,12 @@
      0    1      2 .. 9            10
     | 55 | kind | 8 bytes of data | sum of bytes 0..9 mod 256 |      kind 50..5F, 11 bytes
 
-Bluetooth and SD models send another variant, 55 61 and 18 or 26 bytes of data without a checksum.
-It contains no quaternion and is recognised only.
+Bluetooth and SD models send another variant: 55 61 and 18 or 26 bytes of data without a checksum.
+This variant contains no quaternion, and is only recognised.
 
 Source: protocol pages of the vendor (Standard Communication Protocol).
 
-Invariant: bytes in, frames out; no port, no clock.
+Invariant: the codec converts bytes to frames. It uses no port and no clock.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _OTHER_KIND = 0x61
 _OTHER_SIZES = (20, 28)
 """Distances between the starts of 55 61 frames, bytes."""
 _RUN = 1024
-"""Number of noise bytes after which a run is reported, so that the sum of corrupt bytes is
+"""Number of noise bytes after which a run is reported, so that the number of corrupt bytes is
 current."""
 _AT_START = re.compile(b"\x55")
 _NO_START = CorruptBytes(1, "no frame starts here")
@@ -36,7 +36,7 @@ _CHECKSUM = CorruptBytes(1, CHECKSUM)
 
 
 class WitMotionFrameKind(IntEnum):
-    """Second byte of a frame."""
+    """Kind of a frame, which is its second byte."""
 
     TIME = 0x50
     ACCELERATION = 0x51
@@ -50,22 +50,22 @@ class WitMotionFrameKind(IntEnum):
     QUATERNION = 0x59
     SATELLITES = 0x5A
     REGISTERS = 0x5F
-    """Reply to a read command: four registers."""
+    """Reply to a read command, with four registers."""
 
 
 class WitMotionFrame(NamedTuple):
-    """One frame with a valid checksum."""
+    """One frame whose checksum is correct."""
 
     kind: int
     data: bytes
     """Eight bytes of data."""
     end: int = 0
-    """Number of bytes fed to the codec up to and including the checksum, for back-dating of the
+    """Number of bytes fed to the codec until the end of the checksum, for back-dating of the
     message."""
 
 
 def encode(kind: int, data: bytes) -> bytes:
-    """Return the frame on the wire.
+    """Return the bytes of a frame on the wire.
 
     Raises
     ------
@@ -79,16 +79,16 @@ def encode(kind: int, data: bytes) -> bytes:
 
 
 class WitMotionCodec(ResynchronizingCodec[WitMotionFrame]):
-    """Decoder of pieces of any size to frames; the result does not depend on the pieces.
+    """Codec that converts byte strings of any size to frames; their boundaries do not matter.
 
-    Runs of corrupt bytes are reported at the latest every 1024 bytes.
+    Runs of corrupt bytes are reported after at most 1024 bytes.
     """
 
     def __init__(self) -> None:
         super().__init__(self._read_frame, _AT_START, _RUN, _NO_START.reason, FRAME_BYTES)
         self._other_at = -1
         self.other_frames = 0
-        """Frames so far of the variant 55 61, which is not decoded."""
+        """Number of frames of the variant 55 61 so far. The variant is not decoded."""
 
     def _read_frame(
         self, buffer: bytes, at: int, base: int

@@ -1,9 +1,9 @@
-"""Commands to the registers of WitMotion IMUs.
+"""Commands that write and read the registers of WitMotion IMUs.
 
     FF AA register low high      write; accepted for 10 s after `UNLOCK`, never acknowledged
     FF AA 27 register high       read; answered with a frame 0x5F, by older firmware not at all
 
-Written registers are used at once and stored in flash only by `SAVE`.
+Written registers take effect at once. Only `SAVE` stores them in flash.
 
 Source: protocol pages of the vendor (Standard Communication Protocol).
 """
@@ -26,7 +26,7 @@ class WitMotionRegister(IntEnum):
 
     SAVE = 0x00
     CONTENT = 0x02
-    """Frames to send: bit n is kind 0x50 + n."""
+    """Kinds of frames to send: bit n selects the kind 0x50 + n."""
     RATE = 0x03
     BAUD = 0x04
     MOUNTING = 0x23
@@ -34,26 +34,26 @@ class WitMotionRegister(IntEnum):
     ALGORITHM = 0x24
     """Algorithm: 0 with magnetometer (nine axes), 1 without (six axes)."""
     READ = 0x27
-    """Register of the read command: a register number written to it requests this register and the
-    next three."""
+    """Register of the read command. A register number written to it requests this register and the
+    next three registers."""
     VERSION = 0x2E
     """Firmware version."""
     KEY = 0x69
-    """Register of the unlock command: `_UNLOCKED` written to it allows writing for 10 s."""
+    """Register of the unlock command. `_UNLOCKED` written to it permits writing for 10 s."""
 
 
 _UNLOCKED = 0xB588
 RATE_CODES = {10: 0x06, 20: 0x07, 50: 0x08, 100: 0x09, 200: 0x0B}
-"""Values of the register `RATE`, by rate in Hz."""
+"""Values of the register `RATE` for each rate in Hz."""
 BAUD_CODES = {
     4_800: 0x01, 9_600: 0x02, 19_200: 0x03, 38_400: 0x04, 57_600: 0x05, 115_200: 0x06,
     230_400: 0x07, 460_800: 0x08, 921_600: 0x09,
 }  # fmt: skip
-"""Values of the register `BAUD`, by speed in bit/s."""
+"""Values of the register `BAUD` for each speed in bit/s."""
 
 
 class WitMotionCommand(NamedTuple):
-    """A write to a register."""
+    """A command that writes to a register."""
 
     register: int
     value: int
@@ -65,12 +65,12 @@ def write_register(register: int, value: int) -> bytes:
 
 
 def read_register(register: int) -> bytes:
-    """Return the command that requests a register and the next three."""
+    """Return the command that requests a register and the next three registers."""
     return write_register(WitMotionRegister.READ, register)
 
 
 def decode_command(data: bytes) -> WitMotionCommand | None:
-    """Return the command of five bytes; None if they are none."""
+    """Return the command in five bytes; None if they are not a command."""
     if len(data) != COMMAND_BYTES or (data[0], data[1]) != _HEAD:
         return None
     return WitMotionCommand(*_COMMAND.unpack(data)[2:])
@@ -82,6 +82,6 @@ def content_bits(*kinds: int) -> int:
 
 
 UNLOCK = write_register(WitMotionRegister.KEY, _UNLOCKED)
-"""Command that allows writing for 10 s."""
+"""Command that permits writing for 10 s."""
 SAVE = write_register(WitMotionRegister.SAVE, 0)
 """Command that stores all registers in flash."""

@@ -5,11 +5,12 @@
      0    1     2     3    4           6        6+n
     | FA | BID | MID | FF | n, 2 bytes | data ... | CS |      extended, n = 255..2048
 
-All bytes after FA, the checksum included, sum to 0 mod 256. LEN is 0..254. Numbers are big-endian.
+The sum of all bytes after FA, including the checksum, is 0 mod 256. LEN is 0..254. Numbers are
+big-endian.
 
 Source: MT0101P, MT Low Level Communication Protocol Documentation, rev. 2020.A.
 
-Invariant: bytes in, messages out; no port, no clock.
+Invariant: the codec converts bytes to messages. It uses no port and no clock.
 """
 
 from __future__ import annotations
@@ -23,17 +24,17 @@ from jointfit_protocols.resynchronizing_codec import ResynchronizingCodec
 
 PREAMBLE = 0xFA
 MASTER = 0xFF
-"""BID of a stand-alone device, and of every unsolicited message."""
+"""Bus identifier (BID) of a stand-alone device and of every unsolicited message."""
 MAX_DATA = 2048
-"""Maximum number of bytes of data, by the vendor's documents. It bounds the wait after a corrupt
-length."""
+"""Largest number of data bytes according to the vendor's documents. The limit bounds the wait after
+a corrupt length."""
 MAX_MESSAGE = MAX_DATA + 7
 _EXTENDED = 0xFF
 _HEAD = 4
 
 
 class XbusMessageId(IntEnum):
-    """Message identifiers; a reply is its request plus one."""
+    """Message identifiers. The identifier of a reply is that of its request plus one."""
 
     REQ_DEVICE_ID = 0x00
     DEVICE_ID = 0x01
@@ -85,28 +86,28 @@ class XbusMessageId(IntEnum):
 
 
 class XbusMessage(NamedTuple):
-    """One message with a valid checksum."""
+    """One message whose checksum is correct."""
 
     mid: int
     data: bytes
     bid: int = MASTER
     end: int = 0
-    """Number of bytes fed to the decoder up to and including the checksum, for back-dating of the
+    """Number of bytes fed to the codec until the end of the checksum, for back-dating of the
     message."""
 
     @property
     def size(self) -> int:
-        """Length on the wire, bytes."""
+        """Length of the message on the wire, bytes."""
         return len(self.data) + (5 if len(self.data) < _EXTENDED else 7)
 
 
 def encode(mid: int, data: bytes = b"", bid: int = MASTER) -> bytes:
-    """Return the message on the wire.
+    """Return the bytes of a message on the wire.
 
     Raises
     ------
     ValueError
-        `data` is longer than 2048 bytes.
+        `data` has more than 2048 bytes.
     """
     if len(data) > MAX_DATA:
         raise ValueError(f"{len(data)} bytes of data: an Xbus message holds {MAX_DATA}")
@@ -124,7 +125,7 @@ _LENGTH = CorruptBytes(1, "length outside 255..2048")
 
 
 def _read_message(buffer: bytes, at: int, base: int) -> XbusMessage | CorruptBytes | None:  # noqa: PLR0911 - one for each fault
-    """Return the message that begins at `at`, the reason why none does, or None if it is cut."""
+    """Return the message at `at`, the reason why there is none, or None if it is incomplete."""
     if buffer[at] != PREAMBLE:
         return _NO_START
 
@@ -148,9 +149,9 @@ def _read_message(buffer: bytes, at: int, base: int) -> XbusMessage | CorruptByt
 
 
 class XbusCodec(ResynchronizingCodec[XbusMessage]):
-    """Decoder of pieces of any size to messages; the result does not depend on the pieces.
+    """Codec that converts byte strings of any size to messages; their boundaries do not matter.
 
-    Runs of corrupt bytes are reported at the latest every 2055 bytes.
+    Runs of corrupt bytes are reported after at most 2055 bytes.
     """
 
     def __init__(self) -> None:

@@ -1,7 +1,8 @@
 """Fast decoding of MTData2 messages whose items are the same as in an earlier message.
 
-A device repeats its configured items. The item heads of one message therefore give the place of
-every value in the next one. A message with any other head has another layout.
+A device sends the same configured items in every message. The item heads of one message therefore
+determine the position of every value in the next message. A message with a different head has a
+different layout.
 
 Invariant: the result equals the result of `split` and `decode_item`, or is None.
 """
@@ -21,18 +22,19 @@ if TYPE_CHECKING:
 
 _COUNT_CODES = {1: "B", 2: "H", 4: "I"}
 _HEAD = 2
-"""Values of an item's head: identifier and size."""
+"""Number of values in the head of an item: identifier and size."""
 
 
 class MTData2Layout:
-    """Places of the requested items in a message.
+    """Positions of the requested items in a message.
 
     Parameters
     ----------
     items : sequence of (int, bytes)
-        Items of a message from `split`. `decode_item` must be able to decode the requested ones.
+        Items of a message, as returned by `split`. `decode_item` must be able to decode the
+        requested items.
     wanted : container of int
-        Identifiers to decode, precision and world bits zero.
+        Identifiers to decode, with precision and world bits set to zero.
     """
 
     __slots__ = ("_heads", "_many", "_one", "_read_heads", "_struct", "world_id")
@@ -42,7 +44,7 @@ class MTData2Layout:
         self._one: list[tuple[int, int]] = []
         self._many: list[tuple[int, slice]] = []
         self.world_id = 0
-        """Identifier of the last quaternion; two of its bits encode the world frame."""
+        """Identifier of the last quaternion. Two of its bits encode the world frame."""
         at = 0
 
         for data_id, raw in items:
@@ -65,14 +67,14 @@ class MTData2Layout:
 
     @staticmethod
     def of(items: Sequence[tuple[int, bytes]], wanted: Container[int]) -> MTData2Layout | None:
-        """Return the layout of the items; None without items or a code for a requested one."""
+        """Return the layout of the items; None if there are none, or if one has no struct code."""
         plain = all(
             data_id & 0xFFF0 not in wanted or _form(data_id, raw)[0] for data_id, raw in items
         )
         return MTData2Layout(items, wanted) if items and plain else None
 
     def read(self, data: bytes) -> dict[int, Value] | None:
-        """Return the requested items by identifier; None for a message of another layout."""
+        """Return the requested items by identifier; None for a message with a different layout."""
         if len(data) != self._struct.size:
             return None
 
@@ -87,7 +89,7 @@ class MTData2Layout:
 
 
 def _form(data_id: int, raw: bytes) -> tuple[int, str]:
-    """Return an item's number of values and their struct code; 0 if it has none."""
+    """Return an item's number of values and their struct code; 0 if the item has none."""
     if data_id in COUNT_BYTES:
         return 1, _COUNT_CODES[len(raw)]
     count = reals_in(data_id)

@@ -19,13 +19,14 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 MAX_RATE = 0xFFFF
-"""Request for the highest possible rate. Time and status items always report it."""
+"""Value that requests the highest possible rate. Time and status items always report it."""
 TICK_NS = 100_000
-"""One tick of SampleTimeFine, ns."""
+"""Duration of one tick of SampleTimeFine, ns."""
 WRAP_32_BIT = 1 << 32
-"""Ticks after which SampleTimeFine of most models wraps."""
+"""Number of ticks after which SampleTimeFine of most models wraps."""
 WRAP_DAY = 864_000_000
-"""Ticks after which SampleTimeFine of the MTi-10 and MTi-100 series wraps, at midnight."""
+"""Number of ticks after which SampleTimeFine of the MTi-10 and MTi-100 series wraps, at
+midnight."""
 
 ERRORS = {
     0x03: "period out of range",
@@ -49,11 +50,11 @@ class Output(NamedTuple):
 
     data_id: int
     rate: int
-    """Output rate, Hz; 0 or 0xFFFF is the highest possible rate."""
+    """Output rate, Hz; 0 or 0xFFFF means the highest possible rate."""
 
 
 class SyncSetting(NamedTuple):
-    """One entry of the list of synchronisation settings, which replaces the old list."""
+    """One entry of the list of synchronisation settings. A new list replaces the old list."""
 
     function: int
     """Function of the line: 3 trigger indication, 4 SyncOut, 8 send latest, 9 clock bias, 11 start
@@ -65,9 +66,9 @@ class SyncSetting(NamedTuple):
     skip_first: int = 0
     skip_factor: int = 0
     pulse_width: int = 0
-    """Width of the pulses of an output, 100 us."""
+    """Width of the pulses on an output, 100 us."""
     delay: int = 0
-    """Delay, 100 us; for clock bias estimation the reference period, ms."""
+    """Delay, 100 us. For clock bias estimation, it is the reference period, ms."""
 
 
 class Firmware(NamedTuple):
@@ -84,7 +85,7 @@ class AlignmentRotation(NamedTuple):
     """A rotation that the device applies to its output."""
 
     frame: int
-    """Frame of the rotation: 0 sensor, 1 local (world)."""
+    """Frame that the rotation changes: 0 sensor, 1 local (world)."""
     q: tuple[float, float, float, float]
 
 
@@ -118,7 +119,7 @@ def encode_alignment(rotation: AlignmentRotation) -> bytes:
 
 
 def decode_alignment(data: bytes) -> AlignmentRotation | None:
-    """Return an alignment rotation; None if `data` is not one."""
+    """Return the alignment rotation in `data`; None if `data` are malformed."""
     if len(data) != _ROTATION.size:
         return None
     frame, w, x, y, z = _ROTATION.unpack(data)
@@ -131,7 +132,7 @@ def encode_firmware(firmware: Firmware) -> bytes:
 
 
 def decode_firmware(data: bytes) -> Firmware | None:
-    """Return a firmware revision; None if `data` is not one."""
+    """Return the firmware revision in `data`; None if `data` are malformed."""
     return Firmware(*_FIRMWARE.unpack(data)) if len(data) == _FIRMWARE.size else None
 
 
@@ -141,24 +142,24 @@ def decode_device_id(data: bytes) -> str:
 
 
 def decode_text(data: bytes) -> str:
-    """Return a product code or a label: ASCII, padded with spaces or zeros."""
+    """Return a product code or a label: ASCII text without padding by spaces or zeros."""
     return data.decode("ascii", "replace").strip(" \0")
 
 
 def decode_filter_profile(data: bytes) -> str:
-    """Return a filter profile: the code of older devices, the label of newer ones."""
+    """Return a filter profile: the code for older devices, the label for newer devices."""
     if len(data) == _FILTER_CODE_BYTES:
         return str(int.from_bytes(data, "big"))
     return decode_text(data)
 
 
 def error_text(code: int) -> str:
-    """Return a description of error `code`."""
+    """Return the description of an error code."""
     return f"error 0x{code:02X}, {ERRORS.get(code, 'unknown to this version')}"
 
 
 def fine_time_modulus(product_code: str) -> int | None:
-    """Return the ticks after which SampleTimeFine wraps; None for an unknown model."""
+    """Return the number of ticks after which SampleTimeFine wraps; None for an unknown model."""
     model = re.search(r"MTi-(?:G-)?(\d+)", product_code)
     if model is None:
         return None

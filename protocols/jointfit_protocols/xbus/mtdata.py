@@ -1,24 +1,24 @@
 """MTData, the measurement message of older devices: MTi and MTx of the first generations.
 
 An MTData message has no item heads. The output mode and the output settings of the device define
-the fields of the message, in this order: raw inertial, raw GNSS, temperature, calibrated data,
-orientation, auxiliary inputs, position, velocity, status, sample counter, UTC time. A message is
-refused if its length does not match the mode.
+which fields a message contains. The fields have this order: raw inertial, raw GNSS, temperature,
+calibrated data, orientation, auxiliary inputs, position, velocity, status, sample counter, UTC
+time. A message is rejected if its length does not match the mode.
 
 | output settings | meaning                                                        |
 |-----------------|----------------------------------------------------------------|
 | 0x00000001      | sample counter, U2, wraps                                      |
 | 0x00000002      | UTC time, 12 bytes                                             |
 | 0x0000000C      | orientation: 0 quaternion, 4 Euler angles, 8 matrix            |
-| 0x00000070      | leaves out accelerometer (1), gyroscope (2), magnetometer (4)  |
+| 0x00000070      | omits accelerometer (1), gyroscope (2), magnetometer (4)       |
 | 0x00000300      | reals: 0 float32, 1 12.20, 2 16.32, 3 float64                  |
-| 0x00000C00      | leaves out the auxiliary inputs                                |
+| 0x00000C00      | omits the auxiliary inputs                                     |
 | 0x80000000      | the world is NED                                               |
 
 Source: legacy part of the MT low-level protocol. Fields and their order agree with the open driver
-ethzasl_xsens_driver, which reads float32 alone; no recording was available. Sources differ on the
-world without the NED flag: x to magnetic north, y west, z up in the manuals of MTi and MTx, x to
-the east in that driver.
+ethzasl_xsens_driver, which supports only float32. No recording was available. The sources differ on
+the world without the NED flag. In the manuals of MTi and MTx, x points to magnetic north, y west
+and z up. In that driver, x points east.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ if TYPE_CHECKING:
     from jointfit_protocols.xbus.mtdata2 import Value
 
 PERIOD_HZ = 115_200
-"""Unit of the sample period, 1/s."""
+"""Unit of the sample period: 1/115200 s."""
 COUNTS = 1 << 16
 """Modulus of the sample counter."""
 
 
 class OutputMode(IntFlag):
-    """Fields of a message."""
+    """Fields that a message contains."""
 
     TEMPERATURE = 0x0001
     CALIBRATED = 0x0002
@@ -66,7 +66,8 @@ FORMAT_SHIFT = 8
 NO_INPUT_1, NO_INPUT_2 = 0x400, 0x800
 NED = 0x8000_0000
 _CONFIGURATION = struct.Struct(">96xH6xHI8x")
-"""Number of devices; output mode and settings of the only one."""
+"""Layout of a Configuration message: number of devices, and output mode and settings of the
+first."""
 _ORIENTATION_MASK, _FORMAT_MASK = 0xC, 0x3
 _KNOWN_MODES = sum(OutputMode)
 _RAW_BYTES, _GNSS_BYTES, _UTC_BYTES, _INPUT_BYTES = 20, 44, 12, 2
@@ -74,25 +75,25 @@ _REAL_BYTES = dict(zip(Precision, (4, 4, 6, 8), strict=True))
 
 
 class LegacyField(NamedTuple):
-    """Place of one field that is decoded."""
+    """Position of one decoded field in the message."""
 
     item: int
-    """Identifier of the same quantity in MTData2."""
+    """MTData2 identifier of the same quantity."""
     start: int
     size: int
     reals: int
-    """Number of reals; 0 for an unsigned integer."""
+    """Number of real values; 0 for an unsigned integer."""
 
 
 class MTDataLayout:
-    """Fields of the messages of one device.
+    """Fields in the messages of one device.
 
     Parameters
     ----------
     mode : int
-        Output mode, see `OutputMode`.
+        Output mode; see `OutputMode`.
     settings : int
-        Output settings.
+        Output settings, as in the table of this module.
 
     Raises
     ------
@@ -108,7 +109,7 @@ class MTDataLayout:
         self.precision = Precision(precision)
         self.fields: list[LegacyField] = []
         self.size = 0
-        """Length of the data of a message, bytes."""
+        """Length of the data in a message, bytes."""
 
         self._skip(_RAW_BYTES, mode & OutputMode.RAW_INERTIAL)
         self._skip(_GNSS_BYTES, mode & OutputMode.RAW_GNSS)
@@ -147,11 +148,11 @@ class MTDataLayout:
 
     @property
     def items(self) -> set[int]:
-        """Identifiers of the fields that are decoded."""
+        """Identifiers of the fields that can be decoded."""
         return {field.item for field in self.fields}
 
     def read(self, data: bytes) -> dict[int, Value] | None:
-        """Return the values by identifier; None if the length does not match the mode."""
+        """Return the values by identifier; None if the length does not match the output mode."""
         if len(data) != self.size:
             return None
         values: dict[int, Value] = {}
@@ -166,7 +167,7 @@ class MTDataLayout:
         return values
 
     def write(self, values: Mapping[int, Value]) -> bytes:
-        """Return the data of a message; fields without a value are zeros.
+        """Return the data of a message. Fields without a value are zeros.
 
         Raises
         ------
@@ -186,17 +187,17 @@ class MTDataLayout:
 
 
 def decode_output_mode(data: bytes) -> int | None:
-    """Return the output mode of a reply; None if it is malformed."""
+    """Return the output mode in a reply; None if the reply is malformed."""
     return int.from_bytes(data, "big") if len(data) == 2 else None  # noqa: PLR2004 - U2
 
 
 def decode_output_settings(data: bytes) -> int | None:
-    """Return the output settings of a reply; None if it is malformed."""
+    """Return the output settings in a reply; None if the reply is malformed."""
     return int.from_bytes(data, "big") if len(data) == 4 else None  # noqa: PLR2004 - U4
 
 
 def decode_device_configuration(data: bytes) -> tuple[int, int] | None:
-    """Return output mode and settings of a Configuration; None unless it is of one device."""
+    """Return output mode and settings in a Configuration; None unless it is of one device."""
     if len(data) != _CONFIGURATION.size:
         return None
     devices, mode, settings = _CONFIGURATION.unpack(data)
@@ -209,10 +210,10 @@ def rate_hz(period: bytes, skip: bytes) -> float | None:
     Parameters
     ----------
     period : bytes
-        Reply to the request of the period: U2, in 1/115200 s.
+        Reply with the sample period: U2, in units of 1/115200 s.
     skip : bytes
-        Reply to the request of the output skip factor: U2, samples left out after each; empty if
-        the device has none.
+        Reply with the output skip factor: U2, number of samples omitted after each sent sample. It
+        is empty if the device has no such setting.
     """
     if len(period) != 2 or not any(period) or len(skip) not in {0, 2}:  # noqa: PLR2004 - U2
         return None

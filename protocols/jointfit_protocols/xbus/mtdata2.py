@@ -1,8 +1,8 @@
-"""Items of an MTData2 message, in counts and floats as sent; no unit is converted.
+"""Items of an MTData2 message, with counts and floats as sent and without conversion of units.
 
     | DataID U2 | size U1 | size bytes |   repeated; the run ends exactly at the end of the message
 
-The low nibble of a real-valued item gives its encoding and its world:
+The low four bits of the DataID of a real-valued item define its encoding and its world:
 
 | bits 1:0 | encoding                                  | bytes |   | bits 3:2 | world |
 |----------|-------------------------------------------|-------|   |----------|-------|
@@ -29,38 +29,38 @@ Reals = tuple[float, ...]
 
 
 class Item(IntEnum):
-    """Data identifiers, precision and world bits zero where they have any."""
+    """Data identifiers. Precision and world bits, if any, are zero."""
 
     UTC_TIME = 0x1010
     PACKET_COUNTER = 0x1020
-    """U2, incremented by every MTData2 of any content, wraps."""
+    """U2 counter, which every MTData2 message increments; it wraps."""
     SAMPLE_TIME_FINE = 0x1060
-    """U4, 100 us ticks."""
+    """Time of the sample, U4, in ticks of 100 us."""
     SAMPLE_TIME_COARSE = 0x1070
     """Time of the sample, U4, s."""
     QUATERNION = 0x2010
-    """w x y z, sensor to world."""
+    """Quaternion w x y z from sensor to world."""
     ROTATION_MATRIX = 0x2020
-    """R(q), column by column."""
+    """Rotation matrix R(q), column by column."""
     EULER_ANGLES = 0x2030
     """Roll, pitch, yaw, deg."""
     DELTA_V = 0x4010
-    """Velocity increment of the interval, m/s."""
+    """Increment of velocity in the sample interval, m/s."""
     ACCELERATION = 0x4020
     """Specific force, m/s^2."""
     FREE_ACCELERATION = 0x4030
     """Acceleration without gravity, world coordinates, m/s^2."""
     TRIGGER_IN1 = 0x4810
-    """An edge on a sync input; only in the next message after it."""
+    """An edge on a sync input. It is sent only in the next message after the edge."""
     TRIGGER_IN2 = 0x4820
     GNSS_PVT = 0x7010
     """Position, velocity and time of a GNSS receiver: 94 bytes, not decoded."""
     RATE_OF_TURN = 0x8020
     """Angular rate, rad/s."""
     DELTA_Q = 0x8030
-    """w x y z."""
+    """Increment of orientation in the sample interval, as a quaternion w x y z."""
     MAGNETIC_FIELD = 0xC020
-    """Relative to the field at calibration, no unit."""
+    """Magnetic field relative to the field at calibration, without unit."""
     STATUS_BYTE = 0xE010
     STATUS_WORD = 0xE020
 
@@ -71,11 +71,11 @@ KNOWN_ITEMS = frozenset((
     0x8020, 0x8030, 0x8040, 0x8830, 0x8840, 0x8880, 0x88A0, 0xA010, 0xA020, 0xB010, 0xB020, 0xC020,
     0xD010, 0xE010, 0xE020, 0xE040, 0xE080, 0xE090,
 ))  # fmt: skip
-"""Documented data identifiers, precision and world bits zero; most are not decoded."""
+"""Documented data identifiers, with precision and world bits set to zero. Most are not decoded."""
 
 
 class Precision(IntEnum):
-    """Bits 1:0 of a real-valued item."""
+    """Encoding of a real-valued item, in bits 1:0 of its identifier."""
 
     FLOAT32 = 0
     FIXED_12_20 = 1
@@ -84,7 +84,7 @@ class Precision(IntEnum):
 
 
 class UtcTime(NamedTuple):
-    """Item 0x1010."""
+    """Content of the item 0x1010."""
 
     nanosecond: int
     year: int
@@ -94,18 +94,18 @@ class UtcTime(NamedTuple):
     minute: int
     second: int
     flags: int
-    """Validity: 1 time of week valid, 2 week valid, 4 UTC valid."""
+    """Validity flags: 1 time of week valid, 2 week valid, 4 UTC valid."""
 
 
 class Trigger(NamedTuple):
-    """Items 0x4810 and 0x4820: an edge on a sync input."""
+    """Content of the items 0x4810 and 0x4820: an edge on a sync input."""
 
     line: int
     polarity: int
     time: int
-    """Ticks of SampleTimeFine."""
+    """Time of the edge in ticks of SampleTimeFine."""
     frame: int
-    """Counter of edges, according to the documentation."""
+    """Number of the edge, according to the documentation."""
 
 
 Value = int | Reals | UtcTime | Trigger | bytes
@@ -135,7 +135,7 @@ COUNT_BYTES: dict[int, int] = {
 }
 """Length of the unsigned integer in an item, bytes."""
 _BYTES = (4, 4, 6, 8)
-"""Length of one real number by precision, bytes."""
+"""Length of one real number for each precision, bytes."""
 _UTC = struct.Struct(">IHBBBBBB")
 _TRIGGER = struct.Struct(">BBIH")
 _TRIGGERS = {int(Item.TRIGGER_IN1), int(Item.TRIGGER_IN2)}
@@ -145,17 +145,17 @@ _FLOATS = tuple(struct.Struct(f">{count}f") for count in range(10))
 
 
 def world_of(data_id: int) -> World | None:
-    """Return the world of an item; None for the reserved bit pattern."""
+    """Return the world of an item; None for a reserved bit pattern."""
     return _WORLDS.get(data_id & 0xC)
 
 
 def real_id(item: Item, precision: Precision = Precision.FLOAT32, world: World = "ENU") -> int:
-    """Return the DataID of a real-valued item."""
+    """Return the DataID of a real-valued item with this precision and world."""
     return item | _WORLD_BITS[world] | precision
 
 
 def split(data: bytes) -> list[tuple[int, bytes]] | None:
-    """Return (DataID, bytes) of every item, known or not; None if the run does not end exactly."""
+    """Return DataID and bytes of every item; None if the items do not fill the message exactly."""
     items: list[tuple[int, bytes]] = []
     at, end = 0, len(data)
     while at + _ITEM_HEAD <= end:
@@ -171,7 +171,7 @@ def decode_reals(data_id: int, raw: bytes, count: int) -> Reals | None:
     if len(raw) != count * _BYTES[precision]:
         return None
     if precision == Precision.FLOAT32:
-        return _FLOATS[count].unpack(raw)  # the path every sample takes
+        return _FLOATS[count].unpack(raw)  # every sample takes this path
 
     if precision == Precision.FLOAT64:
         return struct.unpack(f">{count}d", raw)
@@ -202,7 +202,7 @@ def decode_item(data_id: int, raw: bytes) -> Value | None:
 
 
 def encode_reals(data_id: int, values: Iterable[float]) -> bytes:
-    """Encode reals in the precision of `data_id`; fixed-point values are rounded.
+    """Return reals encoded in the precision of `data_id`; fixed-point values are rounded.
 
     Raises
     ------
@@ -222,12 +222,12 @@ def encode_reals(data_id: int, values: Iterable[float]) -> bytes:
 
 
 def encode_item(data_id: int, value: Value) -> bytes:
-    """Encode one item with its head.
+    """Return one encoded item, including its head.
 
     Raises
     ------
     KeyError
-        The value is an integer, and the item is not.
+        The value is an integer, but the item is not.
     struct.error, OverflowError
         A value does not fit the encoding.
     """
@@ -245,10 +245,10 @@ def encode_item(data_id: int, value: Value) -> bytes:
 
 
 def encode_items(items: Iterable[tuple[int, Value]]) -> bytes:
-    """Encode the data of one MTData2 message."""
+    """Return the data of one MTData2 message that contains these items."""
     return b"".join(encode_item(data_id, value) for data_id, value in items)
 
 
 def reals_in(data_id: int) -> int | None:
-    """Return the number of reals in an item; None if it has none."""
+    """Return the number of real values in an item; None if it contains none."""
     return _REALS.get(data_id & 0xFFF0) if world_of(data_id) else None

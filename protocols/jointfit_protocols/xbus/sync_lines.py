@@ -1,15 +1,15 @@
-"""Names of the functions of an Xbus device's sync lines.
+"""Names of the functions that the sync lines of an Xbus device can have.
 
 An entry of the synchronisation settings (`configuration.SyncSetting`) assigns a function to a line.
-An edge on an input with the function ``trigger_indication`` is reported in the next MTData2, item
-TriggerIn1 or TriggerIn2, if the output configuration contains it:
+An edge on an input with the function ``trigger_indication`` is reported in the next MTData2
+message. The output configuration must contain the item TriggerIn1 or TriggerIn2:
 
     | line U1 | polarity U1 | time U4, ticks of SampleTimeFine | frame U2 |
 
-The number of the output line depends on the series: 4, and 7 from the MTi-600 on.
+The number of the output line depends on the series. It is 4, and 7 from the MTi-600 on.
 
-Source: MT0101P rev. 2020.A; layout of the item from the vendor's public headers. These sources do
-not document the unit of its time.
+Source: MT0101P rev. 2020.A. The layout of the item is from the vendor's public headers. These
+sources do not document the unit of the item's time.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from enum import IntEnum
 
 
 class SyncFunction(IntEnum):
-    """Function of a line."""
+    """Function of a sync line."""
 
     TRIGGER_INDICATION = 3
-    """Input: an edge is reported, and bit 21 of the next status word is set."""
+    """Input function: an edge is reported, and bit 21 of the next status word is set."""
     INTERVAL_TRANSITION_MEASUREMENT = 4
-    """Output: a pulse with every sample."""
+    """Output function: a pulse is sent with every sample."""
     SEND_LATEST = 8
-    """Input: an edge requests the newest sample."""
+    """Input function: an edge requests the newest sample."""
     CLOCK_BIAS_ESTIMATION = 9
-    """Input: edges of a known period discipline the device's clock."""
+    """Input function: edges with a known period synchronize the device's clock."""
     START_SAMPLING = 11
-    """Input: an edge starts the sampling."""
+    """Input function: an edge starts sampling."""
     GNSS_1PPS = 14
-    """Input: the pulse of a GNSS receiver."""
+    """Input function: the line receives the pulse per second of a GNSS receiver."""
 
 
 class Polarity(IntEnum):
-    """Edge that counts."""
+    """Edges that are used."""
 
     RISING = 1
     FALLING = 2
@@ -47,7 +47,7 @@ CLOCK_IN, IN1, IN2 = 0, 2, 9
 _OUT, _OUT_600 = 4, 7
 _SERIES_600 = 600
 LINES = ("clock_in", "in1", "in2", "out1")
-"""Names of the lines, as printed on the devices' data sheets."""
+"""Names of the lines in the data sheets of the devices."""
 
 
 def line_code(name: str, product_code: str) -> int:
@@ -56,7 +56,7 @@ def line_code(name: str, product_code: str) -> int:
     Raises
     ------
     KeyError
-        There is no line of that name.
+        No line has this name.
     """
     model = re.search(r"MTi-(?:G-)?(\d+)", product_code)
     late = model is not None and _SERIES_600 <= int(model[1]) < _SERIES_600 + 100

@@ -1,4 +1,4 @@
-"""Xsens XCDI over CAN: messages, groups and the unit of SampleTime."""
+"""Wire format XCDI of Xsens over CAN: messages, groups, and the unit of SampleTime."""
 
 from jointfit_protocols.xcdi._messages import (
     COUNTER_MODULUS,

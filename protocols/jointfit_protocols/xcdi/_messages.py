@@ -1,17 +1,18 @@
-"""Xsens XCDI: the CAN messages of MTi-600, Sirius and Avior, decoded and encoded.
+"""CAN messages of the protocol XCDI of Xsens MTi-600, Sirius and Avior, in both directions.
 
 Every quantity is sent in a separate frame. The frames of one sensor at one instant form a group:
 
     SampleTime  GroupCounter  ...  Quaternion        lowest identifier first
     U4 ticks    U2            ...  4 x I2 / 32767, w x y z, sensor to world, ENU
 
-Frames of other sensors interleave, so groups are assembled per sensor. Identifiers are
-configurable: by default the data identifier itself, but any 11- or 29-bit value is possible.
+Frames of other sensors may arrive in between, so groups are assembled separately for each sensor.
+Identifiers can be configured. By default, they are the data identifiers, but any 11- or 29-bit
+value is possible.
 
-Source: Xsens MT1604P rev. A (2019) and the vendor's CAN pages; byte order from third-party
-decoders. The sources disagree on the unit of SampleTime (100 us or 1 us): see `TickUnit`.
+Source: Xsens MT1604P rev. A (2019) and the vendor's CAN pages. The byte order is from third-party
+decoders. The sources disagree on the unit of SampleTime (100 us or 1 us); see `TickUnit`.
 
-Invariant: frames in, counts out; no bus, no clock.
+Invariant: the codec converts frames to counts. It uses no bus and no clock.
 """
 
 from __future__ import annotations
@@ -26,17 +27,17 @@ from jointfit_protocols.corrupt import CorruptBytes
 ByteOrder = Literal["big", "little"]
 
 TICKS_MODULUS = 2**32
-"""Ticks after which SampleTime wraps."""
+"""Number of ticks after which SampleTime wraps."""
 COUNTER_MODULUS = 2**16
-"""Groups after which GroupCounter wraps."""
+"""Number of groups after which GroupCounter wraps."""
 QUATERNION_SCALE = 1 / 32767
-"""Value of one count. 0x8000 is -1.00003: to be normalised, not rejected."""
+"""Value of one count. The count 0x8000 is -1.00003, which must be normalised and not rejected."""
 OVERFLOW = 1
-"""Error code: the output buffer overflowed, and at least one frame is lost."""
+"""Error code that the output buffer overflowed, so that at least one frame is lost."""
 
 
 class DataId(IntEnum):
-    """Content of a frame; also its identifier unless configured otherwise."""
+    """Content of a frame. It is also the identifier of the frame unless configured otherwise."""
 
     ERROR = 0x01
     SAMPLE_TIME = 0x05
@@ -54,9 +55,9 @@ class XcdiLayout(NamedTuple):
     """Layout of a message."""
 
     fields: str
-    """``struct`` codes, without byte order."""
+    """``struct`` codes of the fields, without byte order."""
     scale: float
-    """SI (or degrees, for EULER) per count."""
+    """SI value of one count; for EULER, degrees per count."""
     unit: str
 
 
@@ -79,14 +80,14 @@ _STRUCTS: dict[ByteOrder, dict[DataId, struct.Struct]] = {
 
 
 def layout(data_id: DataId) -> XcdiLayout:
-    """Return the layout of message `data_id`."""
+    """Return the layout of messages with the content `data_id`."""
     return _LAYOUTS[data_id]
 
 
 def decode(
     data_id: DataId, data: bytes, byte_order: ByteOrder = "big"
 ) -> tuple[int, ...] | CorruptBytes:
-    """Return the counts in the data field of a message, in wire order; never raises."""
+    """Return the counts in the data field of a message, in wire order; never raise."""
     message = _STRUCTS[byte_order][data_id]
     if len(data) != message.size:
         return CorruptBytes(
@@ -101,19 +102,19 @@ def encode(data_id: DataId, counts: tuple[int, ...], byte_order: ByteOrder = "bi
     Raises
     ------
     struct.error
-        A count that does not fit its field, or a wrong number of counts.
+        A count does not fit into its field, or the number of counts is wrong.
     """
     return _STRUCTS[byte_order][data_id].pack(*counts)
 
 
 def quaternion_counts(q: tuple[float, float, float, float]) -> tuple[int, int, int, int]:
-    """Return unit quaternion `q` (w, x, y, z) as the device sends it: rounded to 1/32767."""
+    """Return the counts that a device sends for the unit quaternion `q` (w, x, y, z)."""
     w, x, y, z = (max(-32768, min(32767, round(part * 32767))) for part in q)
     return w, x, y, z
 
 
 class XcdiIds(NamedTuple):
-    """Identifiers of one sensor; None: not received."""
+    """Identifiers of one sensor; None for frames that are not received."""
 
     sample_time: int | None = int(DataId.SAMPLE_TIME)
     group_counter: int | None = int(DataId.GROUP_COUNTER)
@@ -121,10 +122,10 @@ class XcdiIds(NamedTuple):
     status_word: int | None = int(DataId.STATUS_WORD)
     error: int | None = int(DataId.ERROR)
     extended: bool = False
-    """Whether identifiers have 29 bits even where the numbers would fit 11 bits."""
+    """Whether identifiers have 29 bits, even if the numbers would fit into 11 bits."""
 
     def by_id(self) -> dict[tuple[int, bool], DataId]:
-        """Return the content of each (identifier, is 29-bit)."""
+        """Return the content of each identifier; a key is (number, whether it has 29 bits)."""
         return {
             (number, self.extended or number > STANDARD_MAX): DataId[name.upper()]
             for name, number in self._asdict().items()
@@ -133,7 +134,7 @@ class XcdiIds(NamedTuple):
 
 
 def id_block(base: int, *, extended: bool = False) -> XcdiIds:
-    """Return the identifiers of a sensor whose data identifiers are all increased by `base`."""
+    """Return the identifiers of a sensor: all data identifiers increased by `base`."""
     return XcdiIds(
         sample_time=base + DataId.SAMPLE_TIME,
         group_counter=base + DataId.GROUP_COUNTER,
@@ -145,25 +146,25 @@ def id_block(base: int, *, extended: bool = False) -> XcdiIds:
 
 
 class XcdiGroup(NamedTuple):
-    """One orientation and the other values of its group, as sent."""
+    """One orientation, and the other values of its group, as sent."""
 
     t_ns: int
-    """Stamp of the first frame of the group, or of the Quaternion frame if SampleTime is
+    """Stamp of the first frame of the group, ns; of the Quaternion frame if SampleTime is
     missing."""
     ticks: int | None
-    """SampleTime; None if no group was open."""
+    """SampleTime; None if the group had none."""
     counter: int | None
     status: int | None
     quaternion: tuple[int, int, int, int]
-    """Counts of 1/32767, w x y z."""
+    """Counts of 1/32767 in the order w x y z."""
 
 
 class XcdiError(NamedTuple):
-    """The device reported an error."""
+    """An error that the device reported."""
 
     t_ns: int
     code: int
-    """Error code; 1: its output buffer overflowed, at least one frame is lost."""
+    """Error code. 1 means that the output buffer overflowed, so that at least one frame is lost."""
 
 
 XcdiMessage = XcdiGroup | XcdiError | CorruptBytes
@@ -174,11 +175,11 @@ _GROUP_COUNTER, _ERROR = DataId.GROUP_COUNTER, DataId.ERROR
 
 
 class XcdiCodec:
-    """Decoder of one sensor's frames to groups; never raises.
+    """Codec that converts one sensor's frames to groups; it never raises.
 
-    SampleTime opens a group and Quaternion completes it. A second SampleTime, or a second counter,
-    before the Quaternion counts as one incomplete group. A Quaternion without an open group has its
-    counter but no device time. Frames with other identifiers are ignored and counted.
+    SampleTime opens a group, and Quaternion completes it. A second SampleTime or counter before the
+    Quaternion counts as one incomplete group. A Quaternion without an open group has a counter but
+    no device time. Frames with other identifiers are counted and ignored.
 
     Parameters
     ----------
@@ -196,16 +197,17 @@ class XcdiCodec:
         self._counter: int | None = None
         self._status: int | None = None
         self.messages = 0
-        """Well-formed frames of this sensor."""
+        """Number of well-formed frames of this sensor."""
         self.incomplete = 0
-        """Groups without a Quaternion."""
+        """Number of groups without a Quaternion."""
         self.ungrouped = 0
-        """Quaternions without an open group: their SampleTime was lost, or is not sent."""
+        """Number of Quaternions without an open group, because SampleTime was lost or is not
+        sent."""
         self.foreign = 0
-        """Frames of other devices."""
+        """Number of frames of other devices."""
 
     def feed(self, frame: CanFrame) -> XcdiMessage | None:
-        """Return the message that `frame` completed, or None."""
+        """Return the message that `frame` completes; None if it completes none."""
         t_ns, can_id, data, extended, error, remote = frame
         data_id = self._by_id.get((can_id, extended))
         if data_id is None or error or remote:
@@ -239,7 +241,7 @@ class XcdiCodec:
         return None
 
     def flush(self) -> None:
-        """Discard an open group."""
+        """Discard an incomplete group."""
         self._open(0, None)
 
     def _open(self, t_ns: int, ticks: int | None) -> None:

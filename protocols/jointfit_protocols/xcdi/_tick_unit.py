@@ -1,15 +1,16 @@
 """Unit of the SampleTime of an XCDI device, determined from the data.
 
-MT1604P gives microseconds, the vendor's current pages ticks of 100 us. The rate is thus near
-10^6 or 10^4 ticks per second. These are two decades apart, more than a wrong nominal rate explains.
+MT1604P states microseconds, and the vendor's current pages state ticks of 100 us. The rate is
+therefore near 10^6 or 10^4 ticks per second. These differ by a factor of 100, which a wrong nominal
+rate cannot explain.
 
-The first estimate uses no arrival time: ticks per sample, from SampleTime and GroupCounter, times
-the configured sample rate. Frames that were buffered while the host was busy arrive within
-microseconds of each other, so a rate measured over few arrivals can be wrong by any factor.
-Arrivals over spans of a second or more decide where the first estimate is near neither unit, and
-where two such spans in a row contradict it.
+The first estimate uses no arrival times. It is the number of ticks per sample, from SampleTime and
+GroupCounter, times the configured sample rate. Arrival times are not used because frames that were
+buffered while the host was busy arrive within microseconds. A rate measured over few arrivals can
+therefore be wrong by any factor. Arrivals over spans of at least a second are used in two cases:
+the first estimate is near neither unit, or two consecutive spans contradict it.
 
-Invariant: pure arithmetic on ticks, counters and arrival stamps.
+Invariant: the result depends only on ticks, counters and arrival stamps.
 """
 
 from __future__ import annotations
@@ -20,21 +21,21 @@ from statistics import median
 from jointfit_protocols.xcdi._messages import COUNTER_MODULUS, TICKS_MODULUS
 
 TICK_NS = {"100us": 100_000, "1us": 1_000}
-"""Duration of a tick, ns, by the name of the unit."""
+"""Duration of a tick for each name of a unit, ns."""
 
 _STEPS = 10
-"""Steps before the unit is determined."""
+"""Number of steps after which the unit is determined."""
 _NEAR = 0.5
 """Largest deviation from 10^4 or 10^6 ticks per second, decades."""
 _SPAN_NS = 1_000_000_000
-"""Least span of arrivals that measures the rate, ns."""
+"""Shortest span of arrivals over which the rate is measured, ns."""
 _CONTRADICTIONS = 2
-"""Consecutive spans of arrivals that correct the unit."""
+"""Number of consecutive spans of arrivals that correct the unit."""
 _NS = 1_000_000_000
 
 
 class TickUnit:
-    """Determines the unit from groups, and corrects it if arrivals contradict it.
+    """Determines the unit from groups, and corrects it if the arrivals contradict it.
 
     Parameters
     ----------
@@ -46,11 +47,11 @@ class TickUnit:
         self._rate_hz = rate_hz
         self._tick_ns: int | None = None
         self.ticks_per_s: float | None = None
-        """Last measured rate, ticks/s; None before ten steps."""
+        """Most recently measured rate, ticks/s; None before ten steps."""
         self.restart()
 
     def restart(self) -> None:
-        """Discard the groups, but not the unit: the device restarted."""
+        """Discard the groups but not the unit, because the device restarted."""
         self._last: tuple[int, int | None] | None = None
         self._steps: list[float] = []  # ticks per sample
         self._since_ns: int | None = None
@@ -71,7 +72,7 @@ class TickUnit:
         Returns
         -------
         int or None
-            1 000 or 100 000 ns; None while undetermined.
+            Duration of a tick, 1 000 or 100 000 ns; None while it is not determined.
         """
         last, self._last = self._last, (ticks, counter)
         if last is None or self._since_ns is None:
@@ -94,7 +95,7 @@ class TickUnit:
         return self._tick_ns
 
     def _end_span(self, t_ns: int) -> None:
-        """Compare the unit with the arrivals since the last call."""
+        """Compare the unit with the arrivals since the previous call."""
         elapsed_ns, ticks = t_ns - (self._since_ns or 0), self._span_ticks
         self._since_ns, self._span_ticks = t_ns, 0
 
@@ -109,7 +110,7 @@ class TickUnit:
             self._tick_ns, self._contradictions = measured, 0
 
     def _nearest(self, ticks_per_s: float) -> int | None:
-        """Return the tick, ns, of the unit with nearly this rate."""
+        """Return the duration of a tick, ns, in the unit whose rate is near `ticks_per_s`."""
         if ticks_per_s <= 0:
             return None
         self.ticks_per_s = ticks_per_s

@@ -1,4 +1,4 @@
-"""x-io x-IMU3 over UART or USB: framing, data messages in ASCII and binary, commands in JSON."""
+"""Wire format of the x-io x-IMU3 over UART or USB: framing, data messages, commands in JSON."""
 
 from jointfit_protocols.ximu3._framing import MAX_LINE, XImu3Codec
 from jointfit_protocols.ximu3._messages import (

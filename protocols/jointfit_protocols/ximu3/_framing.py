@@ -1,9 +1,10 @@
-"""Bytes of an x-IMU3 to messages: lines that end with LF.
+"""Conversion of the bytes of an x-IMU3 to messages, which are lines that end with LF.
 
-A line that is no message may still end with one, because the terminator before it was lost. Its
-last bytes are therefore searched for a message, one byte after the other.
+A line that is not a message may still end with a message, because the terminator before the message
+was lost. The end of such a line is therefore searched for a message at every byte.
 
-Invariant: bytes in, messages out; no port, no clock. The result does not depend on the pieces.
+Invariant: the codec converts bytes to messages. It uses no port and no clock, and the boundaries of
+the byte strings do not matter.
 """
 
 from __future__ import annotations
@@ -24,35 +25,39 @@ from jointfit_protocols.ximu3._messages import (
 )
 
 MAX_LINE = 4096
-"""Longest message, bytes, terminator included: the buffer of the vendor's software."""
+"""Longest message including its terminator, bytes, which is the buffer size of the vendor's
+software."""
 _SEARCHED = 256
-"""Last bytes of a corrupt line that are searched for a message: more than any with numbers."""
+"""Number of bytes at the end of a corrupt line that are searched for a message. Every message with
+numbers is shorter."""
 _MOST_PENDING = MAX_LINE + _SEARCHED
 _NEVER = 1 << 62
-"""Modulus that makes -1, the result of a search without a match, larger than every position."""
+"""Number added so that -1, the result of a search without a match, exceeds every position."""
 _QUATERNION = (0xD1, 26)
-"""First byte and size of a binary quaternion."""
+"""First byte and size of a binary message with a quaternion."""
 _SHORTEST_RUN = 4
-"""Messages of one kind in a row from which they are decoded together."""
+"""Number of consecutive messages of one kind from which they are decoded together."""
 _LONGEST_RUN = 64
-"""Most messages decoded together; bounds the bytes that a failed attempt has read."""
+"""Largest number of messages decoded together. It limits the bytes that a failed attempt has
+read."""
 _TERMINATORS = bytes((TERMINATOR,)) * _LONGEST_RUN
 _new_data = tuple.__new__
-"""Constructor of a message from all of its fields, in half of the time of its own."""
+"""Constructor of a message from all of its fields. It takes half of the time of the usual
+constructor."""
 _TOO_LONG = f"line longer than {MAX_LINE} bytes"
 _CUT_OFF = "cut off"
 _STARTS = re.compile(
     b"[{" + b"".join(re.escape(bytes((first, first ^ 0x80))) for first, _ in sorted(LAYOUTS)) + b"]"
 )
-"""First bytes of messages that may follow a lost terminator."""
+"""Pattern of the first bytes of messages that may follow a lost terminator."""
 
 Found = XImu3Data | XImu3Reply | CorruptBytes
 
 
 class XImu3Codec:
-    """Decoder of pieces of any size to messages.
+    """Codec that converts byte strings of any size to messages.
 
-    A line without a message becomes one `CorruptBytes`; a line that is too long becomes several.
+    A line without a message becomes one `CorruptBytes`. A line that is too long becomes several.
     """
 
     def __init__(self) -> None:
@@ -62,13 +67,13 @@ class XImu3Codec:
         self.fed = 0
         """Number of bytes fed so far."""
         self.messages = 0
-        """Messages so far."""
+        """Number of messages so far."""
         self.discarded = 0
         """Number of bytes so far that belong to no message."""
 
     @property
     def pending(self) -> int:
-        """Number of bytes of the incomplete message in the buffer, fewer than 4352."""
+        """Number of bytes of the incomplete message in the buffer, always less than 4352."""
         return len(self._pending)
 
     def feed(self, data: bytes) -> list[Found]:
@@ -79,13 +84,15 @@ class XImu3Codec:
         at, base = 0, self.fed - len(self._pending)
         self.fed += len(data)
 
-        # Most lines are binary messages of one kind: their layout is known, also after escapes.
+        # Most lines are binary messages of one kind, whose layout is known even if they contain
+        # escapes.
         (first, size), (kind, layout) = self._usual, LAYOUTS[self._usual]
         size, unpack_from, find = 0 if self._too_long else size, layout.unpack_from, buffer.find
         escape, run_from = find(ESCAPE) % _NEVER, 0
         while (after := find(TERMINATOR, at) + 1) > 0:
             if after - at == size and buffer[at] == first and after <= escape:
-                # A run of such lines is decoded at once; a failed attempt is not repeated inside.
+                # A run of such lines is decoded together. A failed attempt is not repeated within
+                # the run.
                 here = min((min(escape, len(buffer)) - at) // size, _LONGEST_RUN)
                 if here >= _SHORTEST_RUN and at >= run_from:
                     run_from = at + here * size
@@ -130,14 +137,14 @@ class XImu3Codec:
         return found
 
     def flush(self) -> list[Found]:
-        """End the input, or a silence: return the pending bytes as corrupt."""
+        """End the input, or a silence; return the pending bytes as corrupt."""
         found: list[Found] = []
         self._discard(len(self._pending), _TOO_LONG if self._too_long else _CUT_OFF, found)
         self._pending, self._too_long = b"", False
         return found
 
     def _message(self, line: bytes, end: int, found: list[Found]) -> XImu3Data | XImu3Reply | None:
-        """Return the message of a line; bytes before it are appended to `found` as corrupt."""
+        """Return the message of a line, and append the bytes before it to `found` as corrupt."""
         if self._too_long or len(line) > MAX_LINE:
             line, reason = self._shortened(line, found), _TOO_LONG
             self._too_long = False
@@ -147,7 +154,7 @@ class XImu3Codec:
                 return message
             reason = message.reason
 
-        # The terminator of an earlier message may be lost: search the end of the line.
+        # The terminator of an earlier message may be lost, so the end of the line is searched.
         first = max(len(line) - _SEARCHED, 0)
         for start in _STARTS.finditer(line, first):
             rest = parse_rest(line[start.start() :], end)
@@ -158,7 +165,7 @@ class XImu3Codec:
         return None
 
     def _shortened(self, line: bytes, found: list[Found]) -> bytes:
-        """Return the last bytes of a line that is too long; those before them are corrupt."""
+        """Return the end of a line that is too long, and append the bytes before it as corrupt."""
         blocks = max(len(line) - _MOST_PENDING + MAX_LINE, 0) // MAX_LINE
         for _ in range(blocks):
             self._too_long = True
@@ -172,16 +179,16 @@ class XImu3Codec:
 
 
 def _decode_run(run: bytes, usual: tuple[int, int], end: int) -> list[XImu3Data]:
-    """Return the messages of a run without escapes; empty if not all of its lines are `usual`.
+    """Return the messages of a run without escapes; empty if one of its lines is not `usual`.
 
     Parameters
     ----------
     run : bytes
-        Whole multiples of the usual size.
+        Bytes whose number is a multiple of the usual size.
     usual : tuple of int
         First byte and size of each message.
     end : int
-        Bytes fed before the run.
+        Number of bytes fed before the run.
     """
     first, size = usual
     count = len(run) // size

@@ -1,12 +1,12 @@
-r"""Messages of an x-IMU3; each one is a line that ends with LF.
+r"""Messages of an x-IMU3. Each message is a line that ends with LF.
 
     { "key": value }                         command of the host, or reply of the device
     ^ | channel | message                    message of another device, through a multiplexer
     Q,<time, us>,<number>,...,<number>\r\n   data in ASCII; the letter is the kind
     D1 | time U8, us | float32 ... | 0A      data in binary; the kind is the letter | 0x80
 
-Numbers are little-endian. In data messages the bytes 0A and DB before the terminator are sent as
-DB DC and DB DD. There is no checksum: kind, length and escapes are the only checks.
+Numbers are little-endian. In data messages, the bytes 0A and DB before the terminator are sent as
+DB DC and DB DD. There is no checksum. Kind, length and escapes are the only checks.
 
 Source: x-IMU3-Software of x-io Technologies (MIT), API 1.9.
 """
@@ -25,48 +25,49 @@ if TYPE_CHECKING:
 TICK_NS = 1000
 """Unit of device time, ns."""
 BASE_RATE_HZ = 400
-"""Rate, Hz, of which every rate of orientations and inertial messages is a whole fraction."""
+"""Base rate, Hz. Every rate of orientations and inertial messages is the base rate divided by an
+integer."""
 TERMINATOR = 0x0A
 ESCAPE = 0xDB
 MULTIPLEXER = 0x5E
 OBJECT = 0x7B
-"""First byte of a command or reply: an opening brace."""
+"""First byte of a command or reply, which is an opening brace."""
 MOST_CHANNELS = 3
-"""Multiplexers in a row; more are corrupt."""
+"""Largest number of multiplexers in series. More are treated as corrupt."""
 _BINARY = 0x80
 _HEAD = struct.Struct("<BQ")
 _TICKS = 1 << 64
 _PLAUSIBLE_TICKS = 1 << 52
-"""Device time, us, below which a message inside a corrupt line counts as found: 142 years."""
+"""Device time below which a message inside a corrupt line is accepted, us, equal to 142 years."""
 
 
 class DataKind(StrEnum):
-    """Letter of a data message."""
+    """Kind of a data message, as a letter."""
 
     QUATERNION = "Q"
-    """w x y z."""
+    """Quaternion w x y z."""
     MATRIX = "R"
     """Rotation matrix, row by row: xx xy xz yx yy yz zx zy zz."""
     EULER = "A"
     """Roll, pitch, yaw, deg: R = Rz(yaw) Ry(pitch) Rx(roll)."""
     LINEAR_ACCELERATION = "L"
-    """x y z in sensor axes, g; of older firmware after a quaternion."""
+    """Linear acceleration x y z in sensor axes, g; older firmware appends it to a quaternion."""
     EARTH_ACCELERATION = "E"
-    """x y z in the world, g; of older firmware after a quaternion."""
+    """Linear acceleration x y z in the world, g; older firmware appends it to a quaternion."""
     INERTIAL = "I"
     """Angular rate x y z, deg/s; specific force x y z, g."""
     MAGNETIC = "M"
-    """x y z, 1 is the earth's field."""
+    """Magnetic field x y z, in units of the earth's field."""
     HIGH_G = "H"
     """Specific force x y z, g."""
     SYNC = "Y"
-    """Edge at the sync input: 1 rising, 0 falling."""
+    """Edge on the sync input: 1 rising, 0 falling."""
     TEMPERATURE = "T"
-    """Degrees Celsius."""
+    """Temperature, °C."""
     BATTERY = "B"
-    """Charge, percent; voltage, V; state of charging."""
+    """Battery: charge, percent; voltage, V; state of charging."""
     RSSI = "W"
-    """Signal strength of Wi-Fi, percent; power, dBm."""
+    """Wi-Fi: signal strength, percent; power, dBm."""
     BUTTON = "O"
     """State of the button: 1 pressed, 0 released."""
     STATUS = "U"
@@ -74,7 +75,7 @@ class DataKind(StrEnum):
     NOTIFICATION = "N"
     ERROR = "F"
     ACCESSORY = "S"
-    """Bytes sent by an accessory on the serial port of the device."""
+    """Bytes that an accessory sends on the serial port of the device."""
     TIMECODE = "C"
     """Linear timecode, as text."""
 
@@ -86,21 +87,21 @@ COUNTS: dict[str, tuple[int, ...]] = {
     DataKind.SYNC: (1,), DataKind.TEMPERATURE: (1,), DataKind.BATTERY: (3,),
     DataKind.RSSI: (2,), DataKind.BUTTON: (1,),
 }  # fmt: skip
-"""Possible numbers of values of each kind; the other kinds contain text."""
+"""Permitted numbers of values for each kind. The other kinds contain text."""
 LAYOUTS: dict[tuple[int, int], tuple[DataKind, struct.Struct]] = {
     (ord(kind) | _BINARY, _HEAD.size + 4 * count + 1): (
         DataKind(kind), struct.Struct(f"<xQ{count}fx"),
     )
     for kind, counts in COUNTS.items() for count in counts
 }  # fmt: skip
-"""Kind and layout of binary data messages, by first byte and length without escapes."""
+"""Kind and layout of binary data messages, by their first byte and length without escapes."""
 _TEXTS = {ord(kind): kind for kind in DataKind if kind not in COUNTS}
 _KINDS = {ord(kind): kind for kind in DataKind}
 _NUMBER = re.compile(rb"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _LETTERS = range(ord("A"), ord("Z") + 1)
 _UNKNOWN_ASCII = re.compile(rb"[A-Z],\d{1,16},[^,\r]", re.ASCII)
 _MOST_DIGITS = 20
-"""Digits of the largest time."""
+"""Number of digits of the largest time."""
 
 
 class XImu3Data(NamedTuple):
@@ -110,23 +111,23 @@ class XImu3Data(NamedTuple):
     ticks: int
     """Device time, us."""
     values: tuple[float, ...]
-    """Numbers, in the order and units of `DataKind`; empty for text."""
+    """Numbers in the order and units of `DataKind`; empty for text."""
     text: bytes = b""
     binary: bool = True
     size: int = 0
-    """Length on the wire, bytes."""
+    """Length of the message on the wire, bytes."""
     end: int = 0
-    """Bytes fed to the codec up to and including the terminator, for back-dating."""
+    """Number of bytes fed to the codec until the end of the terminator, for back-dating."""
     channel: int | None = None
-    """Channel of the multiplexer; None for the device itself."""
+    """Channel of the multiplexer; None for a message of the device itself."""
 
 
 class XImu3Reply(NamedTuple):
-    """One reply of the device, or one command of the host: both have the same form."""
+    """A reply of the device or a command of the host. Both have the same form."""
 
     key: str
     value: object
-    """Value in force; None in a command that reads it."""
+    """Value in force; None in a command that reads the value."""
     error: str | None = None
     """Reason why the device refused the command."""
     size: int = 0
@@ -135,7 +136,7 @@ class XImu3Reply(NamedTuple):
 
 
 class MessageFault(NamedTuple):
-    """Reason why a line is no message."""
+    """Reason why a line is not a message."""
 
     reason: str
 
@@ -143,7 +144,7 @@ class MessageFault(NamedTuple):
 Line = XImu3Data | XImu3Reply | MessageFault
 UNKNOWN = MessageFault("no known message")
 UNKNOWN_KIND = "message of unknown kind "
-"""Beginning of the reason for a line with the form of a data message, but of unknown content."""
+"""Beginning of the reason for a line that has the form of a data message but unknown content."""
 _JSON = MessageFault("JSON with other than one key, or malformed")
 _STUFFING = MessageFault("escape byte before neither DC nor DD")
 _LENGTH = MessageFault("binary message of another length")
@@ -157,9 +158,9 @@ def parse_line(line: bytes, end: int = 0) -> Line:
     Parameters
     ----------
     line : bytes
-        One line on the wire, terminator included.
+        One line on the wire, including its terminator.
     end : int
-        Bytes fed up to and including the terminator.
+        Number of bytes fed until the end of the terminator.
     """
     channel, at = None, 0
     while line[at] == MULTIPLEXER:
@@ -179,8 +180,9 @@ def parse_line(line: bytes, end: int = 0) -> Line:
 def parse_rest(rest: bytes, end: int) -> XImu3Data | XImu3Reply | None:
     """Return the message that the end of a corrupt line contains; None if there is none.
 
-    Accidental matches are the reason for narrower rules than those of `parse_line`: no text, no
-    multiplexer, a plausible time, and no blank in an object before its key, which would also make
+    The rules are stricter than those of `parse_line`, in order to prevent accidental matches. Text
+    and multiplexers are rejected, and the time must be plausible. An object must have no blank
+    before its key. Otherwise the search of a line of braces would also be slow.
     the search of a line of braces slow.
     """
     if rest[0] == OBJECT:
@@ -197,9 +199,9 @@ def parse_rest(rest: bytes, end: int) -> XImu3Data | XImu3Reply | None:
 
 
 def unstuffed(line: bytes) -> bytes | None:
-    """Return the bytes without escapes; None if an escape is malformed."""
+    """Return the bytes of a message without escapes; None if an escape is malformed."""
     plain = line.replace(b"\xdb\xdc", b"\n").replace(b"\xdb\xdd", b"\xdb")
-    # each escape that is followed by its second byte makes the line one byte shorter
+    # Each escape that is followed by its second byte makes the line one byte shorter.
     return plain if len(line) - len(plain) == line.count(ESCAPE) else None
 
 
@@ -223,7 +225,7 @@ def _parse_data(plain: bytes, size: int, end: int, channel: int | None) -> Line:
 
 
 def _unknown_binary(plain: bytes) -> MessageFault:
-    """Return the reason for a binary line without known layout; it names that of a newer device."""
+    """Return the reason for a binary line without known layout; it may name newer firmware."""
     letter, values = plain[0] ^ _BINARY, (len(plain) - _HEAD.size - 1) / 4
     plausible = values >= 1 and values.is_integer()
     if plausible and letter in _LETTERS and _HEAD.unpack_from(plain)[1] < _PLAUSIBLE_TICKS:
@@ -269,7 +271,7 @@ def _parse_reply(inner: bytes, size: int, end: int, channel: int | None) -> Line
 
 
 class _Pairs(list[tuple[str, object]]):
-    """Members of a JSON object; a dict would lose a repeated key."""
+    """Members of a JSON object. A dict would lose repeated keys."""
 
 
 def _pairs(members: list[tuple[str, object]]) -> _Pairs:
@@ -287,12 +289,12 @@ def _refuse_constant(name: str) -> NoReturn:
 
 
 def encode_command(key: str, value: object = None) -> bytes:
-    """Return a command or reply on the wire; without a value, the command reads or acts.
+    """Return a command or reply on the wire. A command without a value reads a value or acts.
 
     Raises
     ------
     ValueError
-        `value` is no JSON value.
+        `value` cannot be represented in JSON.
     """
     text = json.dumps({key: value}, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
     return text.encode() + b"\n"
@@ -301,20 +303,20 @@ def encode_command(key: str, value: object = None) -> bytes:
 def encode_data(
     kind: str, ticks: int, values: Sequence[float], *, binary: bool = True, decimals: int = 4
 ) -> bytes:
-    """Return a data message with numbers on the wire.
+    """Return the bytes of a data message with numbers on the wire.
 
     Parameters
     ----------
     kind : str
-        Letter, see `DataKind`.
+        Letter of the kind; see `DataKind`.
     ticks : int
         Device time, us.
     values : sequence of float
-        As many as the kind has, in its units.
+        Values in the units of the kind. Their number must be permitted for the kind.
     binary : bool
-        Binary with float32, or ASCII.
+        Whether the message is binary (float32) or ASCII.
     decimals : int
-        Decimals in ASCII.
+        Number of decimals in ASCII.
 
     Raises
     ------
@@ -332,12 +334,12 @@ def encode_data(
 
 
 def encode_text(kind: str, ticks: int, text: bytes, *, binary: bool = True) -> bytes:
-    """Return a data message with text on the wire.
+    """Return the bytes of a data message with text on the wire.
 
     Raises
     ------
     ValueError
-        The kind has numbers instead of text.
+        Messages of this kind contain numbers instead of text.
     """
     if kind in COUNTS:
         raise ValueError(f"a message of kind {kind} has numbers, not text")
@@ -347,7 +349,7 @@ def encode_text(kind: str, ticks: int, text: bytes, *, binary: bool = True) -> b
 
 
 def encode_multiplexed(channel: int, message: bytes) -> bytes:
-    """Return a message of another device, as a multiplexer passes it on."""
+    """Return a message of another device in the form in which a multiplexer passes it on."""
     return bytes((MULTIPLEXER, channel)) + message
 
 
