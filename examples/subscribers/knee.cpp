@@ -1,4 +1,4 @@
-// Print the knee flexion ten times a second: ./knee [HOST [PORT [BASE]]]
+// Print the knee flexion ten times per second: ./knee [HOST [PORT [BASE]]]
 // apt install g++ libmosquitto-dev nlohmann-json3-dev; g++ -std=c++17 -o knee knee.cpp -lmosquitto
 #include <cstdio>
 #include <string>

@@ -1,5 +1,5 @@
-% Print the knee flexion once a second. Needs the Industrial Communication Toolbox (R2022a or newer).
-% This file is not run by the tests of jointfitd: MATLAB is not free.
+% Print the knee flexion once per second. The script needs the Industrial Communication Toolbox (R2022a or newer).
+% The tests of jointfitd do not run this file, because MATLAB is not free.
 broker = "tcp://127.0.0.1";
 base = "jointfit/bench-1";                % [mqtt] base of rig.toml
 

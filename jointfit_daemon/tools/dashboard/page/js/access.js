@@ -1,12 +1,12 @@
-// What the account of the page may read and request. A broker hides a topic without a word: it grants
-// the subscription and passes nothing on. The daemon publishes `bridge/state` after all other retained
-// topics, so a topic that is missing some seconds later is hidden.
+// Read and request permissions of the page's account. A broker hides a topic without a message: it grants
+// the subscription but sends no message. The daemon publishes `bridge/state` after all other retained
+// topics, so a topic that is missing some seconds later is hidden from the account.
 
 const SETTLE_MS = 3000;
-const CHECK_WITHIN_MS = 2000; // pages that return together after a restart ask one after another
+const CHECK_WITHIN_MS = 2000; // pages that reconnect together after a restart check one after another
 const EXPECTED = ["bridge/info", "bridge/health", "calibration", "pose/ui"];
 
-/** Return the observer of the rights on a rig; `requests` is that of requests.js. */
+/** Return the observer of the permissions on a rig; `requests` is from requests.js. */
 export function createAccess(link, store, requests) {
   const access = { link, store, checked: null, mayRequest: null, since: null };
   access.update = () => {
@@ -22,7 +22,7 @@ export function createAccess(link, store, requests) {
   return access;
 }
 
-// Listing the newest calibration changes nothing, and its answer shows that requests are permitted.
+// The request for the newest calibration has no effect, and its answer shows that requests are permitted.
 async function check(access, requests) {
   const account = access.checked;
   let may;
@@ -46,7 +46,7 @@ export function hiddenTopics({ link, store, since }) {
   const missing = (topic) => !store.received.has(topic) && !refused.includes(topic);
   const hidden = [...refused];
   if (store.bridge === "unknown") hidden.push("bridge/state");
-  // A daemon that is not running publishes no poses, and a new rig no calibration.
+  // A daemon that is not running publishes no poses, and a new rig has no calibration.
   if (store.bridge === "online") hidden.push(...EXPECTED.filter(missing));
   const devices = Object.keys(store.info?.devices ?? {}).map((name) => `device/${name}/availability`);
   if (store.bridge === "online" && devices.length > 0 && devices.every(missing)) hidden.push("device/+/availability");

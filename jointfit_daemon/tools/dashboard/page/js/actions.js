@@ -18,7 +18,7 @@ export function createActions(store, request, showView) {
   return open;
 }
 
-// Each action: request, texts, an optional field, and the words of the answer.
+// Each action has a request, texts, an optional field, and a function for the text of the answer.
 const ACTIONS = {
   static: () => ({
     menu: "Record the static pose again…", title: "Record the static pose again", button: "Start standing", view: "calibrate",
@@ -136,7 +136,7 @@ async function sendAction(dialog, action, input, request, showView) {
 
 const showAnswer = (dialog, ...content) => dialog.answer.replaceChildren(...content);
 
-// The file, and the command that continues with it on the gateway.
+// Show the file, and the next command for this file on the gateway.
 function recordedContent(data) {
   if (!data.file) return "Nothing is recorded.";
   const lost = data.lost > 0 ? `${data.lost} messages lost` : "nothing lost";
@@ -154,7 +154,7 @@ const shellWord = (text) => (/^[\w./:=@-]+$/.test(text) ? text : `'${text.replac
 
 const LEVELS = { ok: "ok", warning: "warning", error: "error" };
 
-// The findings first, then the number of checks that passed.
+// Show the findings, then the number of passed checks.
 function selfTestContent({ checks }) {
   const found = checks.filter((check) => check.level !== "ok");
   const passed = `${checks.length - found.length} of ${checks.length} checks passed.`;

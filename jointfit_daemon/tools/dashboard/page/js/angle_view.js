@@ -1,4 +1,4 @@
-// The angle of the chosen joint: large number, standard deviation, and the curve of the last 20 s.
+// The chosen angle: large number, standard deviation, and the curve of the last 20 s.
 
 import { byId, createElement, setClass, setText } from "./dom.js";
 import { poseAgeMs, shownSeconds, valueOf } from "./store.js";
@@ -7,7 +7,7 @@ import { UNKNOWN, angleName, flagSentence, formatNumber, isMinorFlag, isolate, t
 const NUMBER_MS = 200;
 const STALE_MS = 1500;
 const OPTICAL_GAP_US = 150_000;
-const GAP_PERIODS = 3.5; // a longer pause than these periods interrupts the curve
+const GAP_PERIODS = 3.5; // a pause of more periods interrupts the curve
 const MARK = { dash: [4, 4], font: "600 12px system-ui, sans-serif" };
 const HAS_SD = /^(flexion|elevation|inner)_deg$/;
 const STORED_CHOICE = "jointfit-angle";
@@ -44,7 +44,7 @@ function update(view, atOnce) {
     setText(byId("angle-reason"), noAngleReason(store));
     return;
   }
-  // A new theme or size draws the panel again; an old number must not return with it.
+  // A new theme or size redraws the panel. An old number must not appear again.
   if (poseAgeMs(store) < STALE_MS && (atOnce || began - view.lastNumber >= NUMBER_MS)) {
     view.lastNumber = began;
     updateNumber(view);
@@ -79,12 +79,12 @@ function updateChoices(view) {
   view.choice = JSON.parse(select.value);
 }
 
-/** Return the chosen joint and angle in words, such as "Knee flexion". */
+/** Return the chosen joint and angle as text, such as "Knee flexion". */
 export function chosenTitle(view) {
   return view.choice === null ? "Joint angle" : `${isolate(titleOf(view.choice[0]))} ${angleName(view.choice[1])}`;
 }
 
-/** Return the present value and standard deviation of the chosen angle, null if unknown. */
+/** Return the current value and standard deviation of the chosen angle; null if unknown. */
 export function chosenValue(view) {
   const pose = view.store.pose;
   if (!pose || view.choice === null) return [null, null];
@@ -93,7 +93,7 @@ export function chosenValue(view) {
   return [joint[key] ?? null, sdOf(joint, key)];
 }
 
-// sd_deg is that of the flexion, or of the elevation of a shoulder.
+// sd_deg is the standard deviation of the flexion, or of the elevation of a shoulder.
 function sdOf(joint, key) {
   return HAS_SD.test(key) ? joint.sd_deg ?? null : null;
 }
@@ -108,7 +108,7 @@ function updateNumber(view) {
   setClass(byId("angle-reason"), `reason ${level}`);
 }
 
-/** Return the most important limitation of the angle in words, and its level. */
+/** Return the most important limitation of the angle as text, and its level. */
 function reasonOf(view, value, sd) {
   const flags = view.store.pose.flags ?? [];
   const serious = flags.filter((flag) => !isMinorFlag(flag));
@@ -129,7 +129,7 @@ export function curvesOf(store, [name, key]) {
   let last_us = Infinity;
   for (const pose of store.poses) {
     if (pose.t_us - last_us > gap_us) {
-      // Daemon, broker or network were lost: an unknown value ends the line.
+      // Daemon, broker or network were lost, so an unknown value ends the line.
       times.push((last_us + gap_us / 2 - newest) / 1e6);
       for (const series of [values, upper, lower, optical]) series.push(null);
     }
@@ -159,7 +159,7 @@ function noAngleReason(store) {
   return "The pose contains no joint angle.";
 }
 
-/** Return the angle of the cameras at an instant, between the two frames around it. */
+/** Return the angle from the cameras at a time, interpolated between two frames. */
 function opticalAt(frames, next, t_us, name, key) {
   const [before, after] = [frames[next - 1], frames[next]];
   const a = before && t_us - before.t_us < OPTICAL_GAP_US ? valueOf(before.joints, name)?.[key] ?? null : null;
@@ -190,7 +190,7 @@ function updateChartCaption(view, [, values, , , optical]) {
   return setText(byId("chart-caption"), `Last ${shownSeconds} s: ${range}${cameras}`);
 }
 
-/** Draw the marks of the shown time as numbered lines. */
+/** Draw the marks in the displayed time range as numbered lines. */
 function drawMarks(plot, store, color) {
   const { ctx, bbox } = plot;
   const scale = devicePixelRatio;
@@ -257,7 +257,7 @@ function angleRange(low, high) {
   return [Math.floor((middle - half) / 10) * 10, Math.ceil((middle + half) / 10) * 10];
 }
 
-/** Mark a number and a curve that are out of date. */
+/** Mark an outdated number and curve. */
 export function updateAngleAge(view) {
   const { store } = view;
   const ageMs = poseAgeMs(store);

@@ -1,4 +1,4 @@
-// The one live region of the page: at most one text a second, and never the same text twice.
+// The only live region of the page. It shows at most one text per second, and never the same text twice.
 
 const INTERVAL_MS = 1000;
 

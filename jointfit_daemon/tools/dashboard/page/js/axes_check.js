@@ -1,4 +1,4 @@
-// Check of axes: the live axes of every sensor, to be compared with the housing in the hand.
+// Check of axes, which shows the live axes of every sensor. The user compares them with the housing.
 
 import { createElement, setText } from "./dom.js";
 import { conjugate, multiply, rotate } from "./geometry.js";
@@ -8,7 +8,7 @@ import { formatNumber } from "./words.js";
 const AXES = [["x", [1, 0, 0]], ["y", [0, 1, 0]], ["z", [0, 0, 1]]];
 const SIZE = 150;
 const STALE_MS = 2000;
-const STILL_DEG = 5; // below this angle a sensor counts as not turned
+const STILL_DEG = 5; // angle below which a sensor counts as not turned
 
 /** Return the panel of the check; it subscribes to `sensors/pose` only while it is shown. */
 export function createAxesCheck(store, link) {
@@ -26,7 +26,7 @@ export function createAxesCheck(store, link) {
   const update = () => {
     if (!visible || !isFresh(store)) return;
     updateDrawings(store, drawings, cards);
-    updateNote(); // together with the drawings, which it would move later
+    updateNote(); // before the drawings, because a later change would move them
   };
   store.on("sensors", update);
   setInterval(() => { if (visible) updateNote(); }, 500);
@@ -84,7 +84,7 @@ function createCard(name) {
   return { canvas, turn, start: null, root: createElement("article", { class: "card" }, createElement("h3", { dir: "auto" }, name), canvas, turn) };
 }
 
-/** Return the rotation between two orientations: its angle, degrees, and its nearest sensor axis. */
+/** Return the rotation between two orientations: its angle, degrees, and the nearest sensor axis. */
 export function turnSince(start, q) {
   const [w, ...v] = multiply(conjugate(start), q); // in the axes of the sensor
   const length = Math.hypot(...v);
@@ -113,7 +113,7 @@ function drawAxes(canvas, q, color) {
     context.fillText("no data", middle, middle);
     return;
   }
-  // The viewer looks along y, a little from above and from the right.
+  // The view is along y, slightly from above and from the right.
   const project = ([x, y, z]) => [middle + 100 * (0.9 * x + 0.42 * y), middle - 100 * (0.92 * z + 0.25 * y - 0.12 * x)];
   for (const [name, axis] of AXES) {
     const tip = rotate(q, axis);

@@ -1,4 +1,4 @@
-// The calibration as steps, one at a time: poses drawn, what to do, progress, refusals, result.
+// The calibration in steps, one at a time, with drawn poses, instruction, progress, refusals and result.
 
 import { guidanceOf, stepsOf } from "./calibration_steps.js";
 import { createProgress } from "./calibration_progress.js";
@@ -26,7 +26,7 @@ export function createCalibrateView(store, request) {
     if (phase !== view.phase) {
       view.phase = phase;
       view.chosen = null; // a new phase shows its own step
-      view.message.hidden = true; // the refusal of an earlier request
+      view.message.hidden = true; // it contains the refusal of an earlier request
     }
     update();
   });
@@ -34,7 +34,7 @@ export function createCalibrateView(store, request) {
   return { request: (content) => sendRequest(view, content) };
 }
 
-/** Send a calibration request and show a refusal. */
+/** Send a calibration request; show the reason if it is refused. */
 async function sendRequest(view, content) {
   view.message.hidden = true;
   try {
@@ -60,14 +60,14 @@ function updateView(view) {
   updateResult(view);
 }
 
-/** Return the phase that is or was recorded last, if the status names it. */
+/** Return the current or last recorded phase if the status names it. */
 function recordedPhase(calibration) {
   const { phase, text = "" } = calibration ?? {};
   if (["align", "static", "functional"].includes(phase)) return phase;
   return /^(?:fitting the )?(align|static|functional)\b/.exec(text)?.[1] ?? null;
 }
 
-/** Return the step on the screen: the running one, the chosen one, or the next. */
+/** Return the step to show: the running step, or else the chosen step, or else the next step. */
 function shownStep(view) {
   const { phase, version, kept } = view.store.calibration ?? {};
   const known = (name) => (view.steps.some((step) => step.phase === name) ? name : view.steps[0]?.phase);
@@ -80,7 +80,7 @@ function shownStep(view) {
   return version == null ? known(next) : RESULT;
 }
 
-// The steps are built once for a limb and its cameras, so that buttons keep their focus.
+// The steps are built once for a limb and its cameras, so buttons keep their focus.
 function build(view) {
   const { info } = view.store;
   const cameras = Object.values(info?.devices ?? {}).some((device) => device.kind === "mocap");
@@ -115,7 +115,7 @@ function updateRail(view, shown) {
   }
 }
 
-/** Return the steps that are done: those of this calibration, and those of the one in force. */
+/** Return the completed steps of this calibration and of the active calibration. */
 function finishedSteps({ store, recorded }) {
   const { phase, done = [], quality, version } = store.calibration ?? {};
   const finished = new Set(done);

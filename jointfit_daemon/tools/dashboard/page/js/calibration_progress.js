@@ -38,7 +38,7 @@ export function createProgress(stop) {
   return { root, update };
 }
 
-/** Return the sentence that matters now. */
+/** Return the most important sentence for the user. */
 function instruction(calibration, current, entries) {
   if (calibration.phase === "fitting") return "Computing the result. The sensors continue to stream.";
   if (entries.length > 0) return sentence(entries[0].remedy);
@@ -47,7 +47,7 @@ function instruction(calibration, current, entries) {
 
 const sentence = (text) => text.charAt(0).toLocaleUpperCase() + text.slice(1);
 
-// Entries are changed in place: figures change five times a second.
+// Entries are changed in place, because the numbers change five times per second.
 function updateMissing(list, entries) {
   while (list.children.length > entries.length) list.lastChild.remove();
   while (list.children.length < entries.length) list.append(createElement("li", { dir: "auto" }, createElement("b", {}), createElement("span", {}), createElement("small", {})));

@@ -1,4 +1,4 @@
-// The quality of a calibration in words and tables.
+// The quality of a calibration as text and tables.
 
 import { createElement, createTable } from "./dom.js";
 import { UNKNOWN, formatNumber, titleOf } from "./words.js";

@@ -19,7 +19,7 @@ const LIMBS = [
   { joints: /(?:)/, moves: ["bend"], text: ["Move every joint through its whole range, forward most of the time."] },
 ];
 
-/** Return the steps for a limb; without cameras only the static pose. */
+/** Return the steps for a limb; without cameras, the static pose is the only step. */
 export function stepsOf(info, cameras) {
   const joints = info.joints ?? [];
   const limb = LIMBS.find((kind) => joints.some((name) => kind.joints.test(name))) ?? LIMBS.at(-1);
@@ -44,8 +44,8 @@ export function stepsOf(info, cameras) {
 }
 
 /**
- * Return the parts of a missing movement, "knee: 2 of 12 flexions so far: walk, squat": the object,
- * what was found, and the remedy. A text of another form is its own remedy.
+ * Return the parts of a text such as "knee: 2 of 12 flexions so far: walk, squat": the object,
+ * the finding, and the remedy. A text of another form is a remedy as a whole.
  */
 export function guidanceOf(text) {
   const found = /^([^:]+): (?:(.+): )?(.+)$/s.exec(text);

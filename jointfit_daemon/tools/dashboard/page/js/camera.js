@@ -1,12 +1,12 @@
-// Orthographic camera that looks at the limb from beside its facing direction.
+// Orthographic camera with a view of the limb from the side.
 
 import { dot, mix, norm, rotate, scale, subtract } from "./geometry.js";
 
 const ELEVATION = 0.16;
 const FOLLOW_S = 0.9;
 const TURN_S = 3;
-const MIDDLE = 0.46; // height of the limb's centre in the window, from the top: the floor is below
-const JUMP = 0.5; // distance, in lengths of the limb, that the view does not follow smoothly
+const MIDDLE = 0.46; // height of the limb's centre in the window, from the top, so the floor is visible
+const JUMP = 0.5; // distance, in lengths of the limb, above which the view jumps instead of moving smoothly
 
 /** Return a camera; `turn` is the angle of the view about the vertical, rad; null until it is set. */
 export function createCamera() {
@@ -21,19 +21,19 @@ export function createCamera() {
     follow(points, length, firstSegment, seconds, still) {
       const center = scale(points.reduce((sum, p) => sum.map((v, i) => v + p[i]), [0, 0, 0]), 1 / points.length);
       const lowest = Math.min(...points.map((p) => p[2])) - 0.14 * length;
-      // The first joint changes its place at once when cameras begin or cease to locate it.
+      // The position of the first joint jumps when the cameras begin or stop to locate it.
       const first = camera.target === null || norm(subtract(center, camera.target)) > JUMP * length;
       if (first) camera.floor = null;
       const share = (time) => (first || still ? 1 : 1 - Math.exp(-seconds / time));
 
       camera.target = first ? center : mix(camera.target, center, share(FOLLOW_S));
       camera.length = first ? length : camera.length + (length - camera.length) * share(FOLLOW_S);
-      // The floor is the lowest point seen; it rises slowly if the limb moved to another place.
+      // The floor is the lowest point so far. It rises slowly in case the limb has moved to another position.
       camera.floor = camera.floor === null ? lowest : Math.min(lowest, camera.floor + 0.02 * seconds);
       camera.face(firstSegment, share(TURN_S));
     },
 
-    // The subject's right is the x axis of a segment; facing is perpendicular to it, horizontal.
+    // The x axis of a segment points to the subject's right. The facing direction is horizontal and normal to it.
     face(q, share) {
       if (!q) return;
       const right = rotate(q, [1, 0, 0]);

@@ -1,4 +1,4 @@
-// Dialogs: account of the broker, and the key that signs requests. Neither is stored.
+// Dialogs for the account of the broker and for the key that signs requests. The page stores neither.
 
 import { byId, setText } from "./dom.js";
 
@@ -22,9 +22,9 @@ export function createDialogs(link, requests) {
       setText(byId("login-reason"), reason);
       if (byId("login").open) return;
       byId("login").showModal();
-      if (byId("login-user").value !== "") byId("login-password").focus(); // usually the password was wrong
+      if (byId("login-user").value !== "") byId("login-password").focus(); // the password is the usual mistake
     },
-    /** Return when a key was entered; throws an Error if the dialog was closed without one. */
+    /** Wait until a key is entered; throw an Error if the dialog is closed without a key. */
     askForKey() {
       byId("key-dialog").showModal();
       return new Promise((resolve, reject) => { entered = { resolve, reject }; });

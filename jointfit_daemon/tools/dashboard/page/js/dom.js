@@ -1,6 +1,6 @@
-// Small functions that create and change elements. Text from MQTT is set as text, never as HTML.
+// Functions that create and change elements. Text from MQTT is set as text, never as HTML.
 
-const MOST_COLUMNS = 6; // a table with more does not fit on a phone
+const MOST_COLUMNS = 6; // a table with more columns does not fit on a phone
 const SVG = "http://www.w3.org/2000/svg";
 
 /** Return an element with attributes and children; strings become text. */
@@ -25,7 +25,7 @@ function fill(element, attributes, children) {
 /** Return the element with this id. */
 export const byId = (id) => document.getElementById(id);
 
-/** Set the text of an element if it differs: an equal text must not restart a screen reader. */
+/** Set the text of an element if it differs, because an equal text would restart a screen reader. */
 export function setText(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
@@ -38,7 +38,7 @@ export function setClass(element, name) {
 /** Return a table with a caption, a header row and rows of texts or elements. */
 export function createTable(caption, columns, rows) {
   const wide = columns.length > MOST_COLUMNS;
-  // Rows of a wide table are blocks on a phone: the roles remain those of a table.
+  // On a phone, the rows of a wide table are blocks. The ARIA roles remain those of a table.
   const role = (name) => (wide ? { role: name } : {});
   const cell = (value, column, index) =>
     createElement(
@@ -65,8 +65,8 @@ export function createTable(caption, columns, rows) {
 }
 
 /**
- * Show a table in `root`. Where the root shows a table of the same shape, only the cells that differ
- * change, so that a button with the focus and the scroll position stay.
+ * Show a table in `root`. If `root` already contains a table of the same shape, only different cells
+ * change. The focus and the scroll position therefore remain.
  */
 export function patchTable(root, fresh) {
   const [before, after] = [root, fresh].map((element) => [...element.querySelectorAll("th, td, caption")]);

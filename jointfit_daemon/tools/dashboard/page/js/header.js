@@ -1,16 +1,16 @@
-// Header of the page: rig, state in words, broker, clock, and the one button that matters now.
+// Header of the page: rig, state as text, broker, clock, and the most important button.
 
 import { byId, createElement, setClass, setText } from "./dom.js";
 import { recordingState } from "./recording_panel.js";
 import { gatewayNow, poseAgeMs } from "./store.js";
 import { calibrationSentence, formatClock, isRunning } from "./words.js";
 
-const SILENT_MS = 5000; // poses come at 10 Hz, with or without sensors
+const SILENT_MS = 5000; // poses arrive at 10 Hz, with or without sensors
 const RETAINED_MS = 1000; // retained messages arrive within this time after a connection
 
 /**
- * Return the state of link, daemon and calibration: level, words, and the loss for the banner. With
- * `now_us`, the words have the age of the calibration.
+ * Return the state of link, daemon and calibration: level, text, and the fault for the banner. With
+ * `now_us`, the text contains the age of the calibration.
  */
 export function pageState(link, store, now_us = null) {
   if (link.state === "lost") return { level: "error", words: "Connection lost", loss: link.reason };
@@ -67,7 +67,7 @@ export function createHeader(link, store, configuration, actions) {
   return update;
 }
 
-/** Return label, kind and function of the button that matters now. */
+/** Return label, kind and function of the most important button. */
 function mainAction(link, store, actions) {
   if (link.state === "refused") return { label: "Log in", kind: "primary", action: actions.logIn };
   if (link.state === "lost") return { label: "Reconnect", kind: "primary", action: actions.reconnect };
@@ -93,7 +93,7 @@ export function updateEmptyState(link, store, configuration, rigs, choose) {
   empty.hidden = content === null;
   for (const id of ["limb-panel", "angle-panel"]) byId(id).hidden = content !== null && !known;
   if (content === null) { empty.dataset.kind = ""; return; }
-  if (empty.dataset.kind === content.kind) return; // unchanged: buttons keep their focus
+  if (empty.dataset.kind === content.kind) return; // without a change, buttons keep their focus
   empty.dataset.kind = content.kind;
   empty.replaceChildren(...content.children);
 }

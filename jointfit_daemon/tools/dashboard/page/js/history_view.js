@@ -1,4 +1,4 @@
-// Stored calibrations, newest first, and the choice of the one in force.
+// Stored calibrations, newest first, and the selection of the active calibration.
 
 import { resultOf } from "./calibration_result.js";
 import { byId, createElement, setText } from "./dom.js";
@@ -19,7 +19,7 @@ export function createHistoryView(store, request) {
   return view;
 }
 
-// The list is read again when a calibration comes into force, not with each message of progress.
+// The list is read again when a calibration becomes active, not at each progress message.
 function refresh(view) {
   const { calibration, base } = view.store;
   const state = JSON.stringify([base, calibration?.phase, calibration?.version]);
@@ -68,7 +68,7 @@ function createEntry(view, entry, inForce, busy) {
   );
 }
 
-/** Return the error on held-out movement with its method, or that of the last online learning. */
+/** Return the error on held-out movement with its method, or the error of the last online learning. */
 function errorsOf(entry) {
   const words = (table) => Object.entries(table ?? {}).map(([joint, error]) => `${titleOf(joint)} flexion ${formatNumber(error, 1)}° RMS`).join(", ");
   const learned = entry.online?.after_deg;

@@ -1,4 +1,4 @@
-// The live limb on a canvas: IMUs solid, cameras as an outline, sensor axes, joint uncertainty.
+// The live limb on a canvas: solid from IMUs, outline from cameras, sensor axes, joint uncertainty.
 
 import { createCamera } from "./camera.js";
 import { byId, setText } from "./dom.js";
@@ -7,10 +7,10 @@ import { poseAgeMs, valueOf } from "./store.js";
 import { formatNumber, isolate, titleOf } from "./words.js";
 
 const FRAME_MS = 1000 / 30;
-const DELAY_MS = 110; // one period of pose/ui: the drawing interpolates between two poses
+const DELAY_MS = 110; // one period of pose/ui, because the drawing interpolates between two poses
 const STALE_MS = 1500;
 const SIDE_TURN = -0.6;
-const FRONT_TURN = -1.15; // two legs cover each other from the side
+const FRONT_TURN = -1.15; // in a view from the side, two legs cover each other
 const OPTICAL_MS = 600;
 const TURN_STEP = 0.15;
 const THICKNESS = [0.15, 0.105];
@@ -114,10 +114,10 @@ function draw(view, store, now, seconds) {
   if (store.optical && now - store.opticalReceivedMs < OPTICAL_MS) drawOptical(view, camera, limb, store.opticals);
   drawJoints(view, camera, limb);
   drawSensors(view, camera, limb, store);
-  drawLabels(view, camera, limb, store.info); // last: the axes of a sensor must not cover a name
+  drawLabels(view, camera, limb, store.info); // drawn last, so no sensor axes cover a name
 }
 
-/** Return joints and segments of the drawn instant, between the last two poses. */
+/** Return joints and segments at the drawn time, which is between the last two poses. */
 function interpolate(view, store, now) {
   const { samples } = view;
   const info = store.info;
@@ -146,7 +146,7 @@ function interpolate(view, store, now) {
   return { t_us, joints, segments };
 }
 
-/** Return whether the orientation of a segment is known, and the position of its end is not. */
+/** Return whether the orientation of a segment is known but the position of its end is not. */
 function lacksLength(info, pose, i) {
   return !info.connections && i + 1 < info.joints.length
     && Boolean(valueOf(pose.segments, info.segments[i])?.q) && !valueOf(pose.joints, info.joints[i + 1])?.p_m;
@@ -163,7 +163,7 @@ function endsOf(info, segment) {
   return proximal.length > 0 ? [proximal[0], distal[0]] : distal;
 }
 
-/** Return the length of the stretched limb: that of its longer branch. */
+/** Return the length of the straight limb, along its longer branch. */
 function lengthOf(limb, info) {
   const sums = new Map();
   for (const { name, from, to } of limb.segments) {
@@ -195,7 +195,7 @@ function drawFloor(view, camera, points) {
   }
   context.stroke();
 
-  // The shadow shows where the limb stands on the floor.
+  // The shadow shows the position of the limb above the floor.
   const lowest = points.reduce((low, p) => (p[2] < low[2] ? p : low));
   const shadow = camera.project([lowest[0], lowest[1], floor]);
   context.fillStyle = colors.floor;
@@ -213,7 +213,7 @@ function drawSegments(view, camera, limb) {
   for (const { a, b } of drawn) {
     const outline = capsule(a, b, view.camera.length * camera.pixels);
     const { nx, ny, radius } = outline;
-    // Light comes from the left: the shade across the segment makes it look round.
+    // The light is from the left. The shade across a segment makes it appear round.
     const shade = context.createLinearGradient(a.x + nx * radius, a.y + ny * radius, a.x - nx * radius, a.y - ny * radius);
     const side = nx < 0 ? [0, 1] : [1, 0];
     shade.addColorStop(side[0], colors["imu-light"]);
@@ -238,7 +238,7 @@ function capsule(a, b, limbPixels) {
   return { path, nx, ny, radius: ra };
 }
 
-/** Draw the outline of the limb as the cameras saw it at the drawn instant. */
+/** Draw the outline of the limb from the cameras at the drawn time. */
 function drawOptical(view, camera, limb, frames) {
   const { context, colors } = view;
   context.strokeStyle = colors.optical;
@@ -296,7 +296,7 @@ function drawLabels(view, camera, limb, info) {
   }
 }
 
-/** Return the side of a joint on which its name stands: 1 right, -1 left, 0 none. */
+/** Return the side of a joint on which its name is written: 1 right, -1 left, 0 none. */
 function labelSide(info, name, fromMiddle) {
   if (!info.connections) return 1;
   if (valueOf(info.connections, name) === undefined) return 0; // the middle of the root segment
@@ -359,7 +359,7 @@ function drawAxis(context, from, to, color, halo) {
   context.lineCap = "butt";
 }
 
-/** Describe the limb in words under the drawing, and mark a drawing that is out of date. */
+/** Describe the limb as text under the drawing, and mark an outdated drawing. */
 export function updateLimbCaption(store) {
   const caption = byId("limb-caption");
   const ageMs = poseAgeMs(store);

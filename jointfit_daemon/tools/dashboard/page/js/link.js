@@ -1,4 +1,4 @@
-// Connection to the broker: finds a rig, subscribes, reconnects, and says which part is lost.
+// Connection to the broker, which finds a rig, subscribes, reconnects, and reports the lost part.
 
 import mqtt from "../vendor/mqtt.esm.js";
 
@@ -20,27 +20,27 @@ const OTHER_VERSION = new Set([1, 132]);
 /**
  * Return the link of the page to its broker.
  *
- * `configuration` is that of the server. `handlers` has `changed()` after every change of `state`,
- * `connected()` after every connection,
+ * `configuration` is from the server. `handlers` has `changed()` for every change of `state`,
+ * `connected()` for every connection,
  * `found(base)` for every rig, `message(topic, payload)` for every message of the chosen rig, and
- * `login(reason)` when the broker wants an account.
+ * `login(reason)` if the broker requires an account.
  */
 export function createLink(configuration, handlers) {
   const link = {
     /** "connecting", "connected", "lost" or "refused". */
     state: "connecting",
-    /** Reason in words, for "lost" and "refused". */
+    /** Reason as text, for "lost" and "refused". */
     reason: "",
     /** Browser time of the last change of `state`, ms. */
     sinceMs: 0,
     base: null,
-    rigs: 0, // known on the broker
+    rigs: 0, // number of rigs on the broker
     version: 5,
     account: {},
     client: null,
-    /** Topics that the broker refused to pass on, from the answer to the subscription. */
+    /** Topics that the broker refused in its answer to the subscription. */
     refused: new Set(),
-    /** Topics that a view asked for, beside those of every page. */
+    /** Topics that a view requested, in addition to the topics of every page. */
     wanted: new Set(),
     closeCode: 0,
     closeReason: "",
@@ -69,7 +69,7 @@ export function createLink(configuration, handlers) {
     if (link.client?.connected) subscribe(link);
   };
   link.subscribe = (topic) => {
-    link.wanted.add(topic); // again after each connection
+    link.wanted.add(topic); // subscribed again after each connection
     if (link.client?.connected && link.base !== null) link.client.subscribe(`${link.base}/${topic}`);
   };
   link.unsubscribe = (topic) => {
@@ -95,7 +95,7 @@ function createClient(configuration, link, handlers, change) {
     reconnectPeriod: RECONNECT_MS,
     connectTimeout: 8000,
     resubscribe: false,
-    timerVariant: "native", // workers from blobs are outside of the security policy
+    timerVariant: "native", // the security policy forbids workers from blobs
     createWebsocket: (url, protocols) => openWebSocket(url, protocols, link),
   });
 
@@ -143,7 +143,7 @@ function openWebSocket(url, protocols, link) {
   return socket;
 }
 
-/** Return the reason of a loss; null if it must be asked for. */
+/** Return the reason of a loss; null if the server must be asked for the reason. */
 function lossReason(link, configuration) {
   const { broker, websocket } = configuration;
   if (!navigator.onLine && !/^(localhost|127\.|\[::1\])/.test(location.host)) {
@@ -156,7 +156,7 @@ function lossReason(link, configuration) {
   return `No WebSocket at ${broker}: check that the broker runs, and that this is the port of its WebSocket listener, not its TCP port (often 1883). Without one, start the dashboard with --broker mqtt://HOST:PORT.`;
 }
 
-/** Ask the server of the page for the cause of a loss: the tunnel alone does not show it. */
+/** Ask the server of the page for the cause of a loss, which the tunnel alone does not show. */
 async function serverReason(link, configuration) {
   const opened = link.opened;
   const answer = await fetch("config.json", { cache: "no-store", signal: AbortSignal.timeout(SERVER_MS) }).catch(() => null);
@@ -169,7 +169,7 @@ async function serverReason(link, configuration) {
   return `The broker at ${configuration.broker} does not answer: check that it runs.`;
 }
 
-/** Return why a browser cannot connect to an address of a broker; empty if it can. */
+/** Return the reason why a browser cannot connect to a broker address; empty if it can. */
 function addressFault(websocket) {
   if (location.protocol !== "https:" || !websocket?.startsWith("ws:")) return "";
   return `Pages of https:// cannot connect to ${websocket}. Start the dashboard with --broker wss://HOST/PATH or mqtt://HOST:PORT.`;

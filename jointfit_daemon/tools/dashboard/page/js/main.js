@@ -23,7 +23,7 @@ import { connectTabs } from "./tabs.js";
 import { formatNumber, isolate } from "./words.js";
 
 const REFRESH_MS = 500;
-const SEARCH_MS = 1200; // rigs with retained information answer within this time
+const SEARCH_MS = 1200; // retained messages of rigs arrive within this time
 
 async function readConfiguration() {
   const parameters = new URLSearchParams(location.search);
@@ -32,8 +32,8 @@ async function readConfiguration() {
   return { ...server, base: parameters.get("base") ?? server.base, remark: brokerRemark(parameters.get("broker"), server) };
 }
 
-// The server names the one broker to which its security policy permits connections: an address that
-// somebody sends must not lead a password to another broker.
+// The server names the only broker to which its security policy permits connections. An address from
+// another person must not send a password to another broker.
 function brokerRemark(wanted, server) {
   if (wanted === null || wanted === server.websocket) return "";
   const start = wanted.startsWith("wss://") || wanted.startsWith("ws://") ? wanted : "wss://HOST/PATH";
@@ -69,7 +69,7 @@ async function start() {
     link.choose(base);
     refresh();
   };
-  // Several rigs may share a broker: the only one is chosen after a short search.
+  // Several rigs may use the same broker. If a short search finds only one rig, it is chosen.
   setInterval(() => { if (link.base === null && rigs.size === 1) choose(rigs.keys().next().value); }, SEARCH_MS);
 
   const limb = createLimbView(store);
@@ -113,13 +113,13 @@ async function start() {
   store.on("pose", () => { if (byId("limb-panel").hidden) refresh(); });
   document.addEventListener("visibilitychange", () => { if (!document.hidden) refresh(); });
 
-  // Figures for measurements: messages, and main-thread time of drawing, ms.
+  // Values for measurements: messages, and main-thread time of drawing, ms.
   globalThis.jointfit = { store, link, limb, angle };
   if (configuration.base !== null) choose(configuration.base);
   link.connect();
 }
 
-/** Return the text for screen readers: a change of state, or the angle if that is wanted. */
+/** Return the text for screen readers: a change of state, or the angle if the user has enabled it. */
 function announcement(link, store, angle) {
   const { words, loss } = pageState(link, store);
   const state = loss ? `${words}. ${loss}` : words;

@@ -1,4 +1,4 @@
-// Marks: a form, and one key, that label the present instant in the log and in a recording.
+// Marks: a form and a key that label the current time in the log and in a recording.
 
 import { byId, createElement, setText } from "./dom.js";
 import { formatClock, isolate } from "./words.js";
@@ -8,7 +8,7 @@ const DEFAULT_TEXT = "mark";
 const SHOWN_MS = 5000;
 const STORED_OFF = "jointfit-mark-key-off";
 
-/** Return a function that marks this instant; it returns the answer in words, and throws an Error. */
+/** Return a function that marks the current time. It returns the answer as text, or throws an Error. */
 export function createMarker(store, request) {
   return async (text) => {
     const data = await request("mark", { text: text.trim() || DEFAULT_TEXT });
@@ -18,7 +18,7 @@ export function createMarker(store, request) {
 }
 
 /**
- * Return a form that marks this instant with a text. The text stays and is selected: Enter repeats it,
+ * Return a form that marks the current time with a text. The text remains selected: Enter repeats it,
  * and typing replaces it. `hint` names the key.
  */
 export function createMarkForm(mark, { hint = false } = {}) {
@@ -49,8 +49,8 @@ async function showAnswer(note, answer) {
 }
 
 /**
- * Mark with one key in every view, unless a text field or a dialog has the keyboard, or the user
- * switched it off. The answer appears in the form, or, while it is hidden, for some seconds over the page.
+ * Mark with one key in every view, unless a text field or a dialog has the focus, or the user
+ * has disabled the key. The answer appears in the form; if it is hidden, for some seconds over the page.
  */
 export function connectMarkKey(form, mayMark) {
   const box = byId("mark-key");

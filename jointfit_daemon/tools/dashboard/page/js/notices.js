@@ -23,7 +23,7 @@ export function createNotices(link, store, access, configuration) {
   return () => {
     const found = noticesOf(link, store, access, configuration);
     const text = JSON.stringify(found);
-    if (text === shown) return; // an equal text must not restart a screen reader
+    if (text === shown) return; // an equal text would restart a screen reader
     shown = text;
     list.hidden = found.length === 0;
     list.replaceChildren(...found.map(([level, sentence]) => createElement("li", { class: `notice ${level}`, dir: "auto" }, sentence)));

@@ -1,4 +1,4 @@
-// Version and form of the payloads that the page reads (docs/mqtt.md).
+// Version and structure of the payloads that the page reads (docs/mqtt.md).
 
 /** Version of the payloads that this page reads. */
 export const PAYLOAD_VERSION = 1;
@@ -20,7 +20,7 @@ const FORMS = new Map(Object.entries({
   "optical/pose": isPose,
 }));
 
-/** Return whether a payload has the form of its topic, as far as the page depends on it. */
+/** Return whether a payload has the structure of its topic, as far as the page depends on it. */
 export function hasForm(topic, payload) {
   return isTable(payload) && (FORMS.get(topic)?.(payload) ?? true);
 }

@@ -1,4 +1,4 @@
-// The physical test of one sensor: three rotations by hand, guided here and judged by the daemon.
+// The physical test of one sensor: the page guides three rotations by hand, and the daemon evaluates them.
 
 import { createElement, setClass, setText } from "./dom.js";
 import { formatNumber } from "./words.js";
@@ -22,14 +22,14 @@ export function createPhysicalTest(store, request) {
     status, steps, outcome,
   );
 
-  let running = 0; // number of the test that runs; 0: none
+  let running = 0; // number of the running test; 0 without a test
   let count = 0;
   const setRunning = (number) => {
     const focused = document.activeElement === (number ? start : stop);
     running = number;
     choice.disabled = start.hidden = number !== 0;
     stop.hidden = number === 0;
-    if (focused) (number ? stop : start).focus(); // the button that takes its place
+    if (focused) (number ? stop : start).focus(); // the button that replaces the focused button
   };
   const show = (data) => {
     steps.hidden = data.state === "finished";
@@ -82,7 +82,7 @@ export function createPhysicalTest(store, request) {
   return { root };
 }
 
-// The list shows the present step; the status line is then for screen readers only.
+// The list shows the current step, so the status line is for screen readers only.
 function classOf({ state, result }) {
   if (state === "finished") return `test-status status ${result.agrees ? "ok" : "error"}`;
   return { turning: "test-status visually-hidden", failed: "test-status bad" }[state] ?? "test-status";

@@ -2,8 +2,8 @@
 
 import { createElement, createSvg } from "./dom.js";
 
-// Joints in a box of 100 by 130; the ground is at y = 122. "limb" carries the sensors; "words" are
-// those of the daemon's remedies for which the figure is the right movement.
+// Joints in a box of 100 by 130; the ground is at y = 122. "limb" has the sensors. "words" are
+// words in the daemon's remedies for which the figure shows the right movement.
 const FIGURES = {
   plate: {
     label: "Turn about three axes",
@@ -86,7 +86,7 @@ const FIGURES = {
   },
 };
 
-/** Return the drawings with these names, and a function that marks those of a remedy. */
+/** Return the drawings with these names, and a function that marks the drawings of a remedy. */
 export function createFigures(names) {
   const figures = names.map((name) => ({ ...FIGURES[name], root: drawFigure(FIGURES[name]) }));
   const root = createElement("div", { class: `figures n${figures.length}` }, ...figures.map((figure) => figure.root));

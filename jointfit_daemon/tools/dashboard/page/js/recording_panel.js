@@ -1,16 +1,16 @@
-// The recording: its state, and the buttons that start it, stop it and mark an instant in it.
+// The recording: its state, and the buttons to start it, to stop it, and to mark the current time.
 
 import { byId, createElement, setClass, setText } from "./dom.js";
 import { connectMarkKey, createMarkForm, createMarker } from "./marks.js";
 import { recordingSeconds } from "./store.js";
 import { UNKNOWN, formatBytes, formatDuration, formatStopwatch, titleOf } from "./words.js";
 
-const RATE_AFTER_S = 30; // the first seconds of a file are not typical of its growth
+const RATE_AFTER_S = 30; // before this time, the growth of a file is not typical
 const SHORT_S = 3600;
 const LONGEST_S = 30 * 86_400;
 const LOW_BYTES = 1e9;
 
-/** Return level and words of the recording of a store, for the header. */
+/** Return level and text of a store's recording, for the header. */
 export function recordingState(store) {
   const { recording } = store;
   if (store.bridge !== "online" || recording === null) return ["unknown", UNKNOWN];
@@ -18,7 +18,7 @@ export function recordingState(store) {
   return recording.failure ? ["error", "interrupted"] : ["recording", formatStopwatch(recordingSeconds(store))];
 }
 
-/** Show the recording of a store; return the form of marks and the function that updates the panel. */
+/** Show the recording of a store; return the form for marks and a function that updates the panel. */
 export function createRecordingPanel(store, access, request, openAction) {
   const status = createElement("p", { class: "status unknown digits" }, UNKNOWN);
   const facts = createElement("dl");
@@ -42,7 +42,7 @@ export function createRecordingPanel(store, access, request, openAction) {
     setClass(status, `status digits ${level === "off" ? "unknown" : level}`);
     setText(status, words === UNKNOWN ? "Unknown" : titleOf(words));
     for (const element of [start, stop, form.button, form.text]) element.disabled = reason !== "";
-    // The button with the focus gives it to the one that takes its place.
+    // If the button that disappears has the focus, the button that replaces it receives the focus.
     const focused = document.activeElement === (active ? start : stop);
     start.hidden = active;
     stop.hidden = !active;
@@ -67,7 +67,7 @@ export function createRecordingPanel(store, access, request, openAction) {
   };
 
   start.addEventListener("click", async () => {
-    refusal = ""; // a second start changes nothing
+    refusal = ""; // the recording already runs, so the second start has no effect
     try {
       await request("record", { action: "start" });
     } catch (error) {
@@ -85,7 +85,7 @@ export function createRecordingPanel(store, access, request, openAction) {
   return update;
 }
 
-/** Return why the buttons are disabled; empty if they are not. */
+/** Return the reason why the buttons are disabled; empty if they are enabled. */
 function disabledReason(store, access) {
   if (store.bridge === "lost") return "The page lost its connection: the state of the recording is unknown.";
   if (store.bridge === "offline") return "jointfitd is not running. It completes a file that it was writing at its next start.";
@@ -94,7 +94,7 @@ function disabledReason(store, access) {
   return "";
 }
 
-/** Return terms, texts and levels of the present recording, or of the last one. */
+/** Return terms, texts and levels of the current or the last recording. */
 function factsOf(store) {
   const { recording } = store;
   if (recording === null) return [];
@@ -107,7 +107,7 @@ function factsOf(store) {
   return facts;
 }
 
-// The free space as the time for which it suffices, at the growth of this recording.
+// Return the time for which the free space suffices at the growth rate of this recording.
 function freeSpace({ active, duration_s: duration, written_bytes: bytes }, free) {
   if (free < 1e6) return ["nothing", "warning"];
   const rest_s = active && duration > RATE_AFTER_S && bytes > 0 ? (free * duration) / bytes : Infinity;

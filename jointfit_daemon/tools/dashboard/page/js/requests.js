@@ -1,23 +1,23 @@
-// Requests to the daemon (docs/mqtt.md, "Requests"), signed where the rig requires it.
+// Requests to the daemon (docs/mqtt.md, "Requests"). They are signed if the rig requires it.
 
 const ANSWER_MS = 10_000;
 const NOT_AUTHORISED = 135;
 
-/** Return a sender of requests over a link; `now()` is the gateway's UNIX time, µs. */
+/** Return an object that sends requests over a link; `now()` returns the gateway's UNIX time, µs. */
 export function createRequests(link, now) {
   const waiting = new Map();
   const requests = {
-    /** Key that signs requests; null while none was entered. */
+    /** Key that signs requests; null before a key is entered. */
     key: null,
 
-    /** Pass on an answer of the daemon. */
+    /** Process an answer of the daemon. */
     answer(payload) {
       waiting.get(payload.transaction)?.(payload);
     },
 
     /**
      * Send a request; return the data of the answer. `askForKey` is called if the rig accepts signed
-     * requests only. Throws an Error with a sentence, and with the `faults` of the answer, if the request
+     * requests only. Throw an Error with a sentence, and with the `faults` of the answer, if the request
      * has no effect.
      */
     async ask(command, content, askForKey) {
@@ -31,7 +31,7 @@ export function createRequests(link, now) {
       return requests.ask(command, content, askForKey);
     },
 
-    /** Send a request; return the answer. Throws an Error with a sentence if there is none. */
+    /** Send a request; return the answer. Throw an Error with a sentence if no answer arrives. */
     async send(command, content) {
       if (!link.client?.connected) throw new Error("The page is not connected to the broker.");
       const transaction = crypto.getRandomValues(new Uint32Array(4)).join("-");

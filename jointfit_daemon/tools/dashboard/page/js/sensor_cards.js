@@ -1,10 +1,10 @@
-// One card for each device: state, rate, loss, clock and last event. Red only for what needs a person.
+// One card for each device: state, rate, loss, clock and last event. Red means that a user must act.
 
 import { byId, createElement, setClass, setText } from "./dom.js";
 import { gatewayNow, valueOf } from "./store.js";
 import { UNKNOWN, clockQuality, formatDuration, formatNumber } from "./words.js";
 
-const RATE_SHARE = 0.95; // below this share of the usual rate a device is slow
+const RATE_SHARE = 0.95; // share of the usual rate below which a device is slow
 
 /** Show a card for each device of a store. */
 export function createSensorCards(store) {

@@ -1,4 +1,4 @@
-// The Sensors view: counters and clocks of every device, the daemon, and the checks of axes by hand.
+// The Sensors view: counters and clocks of every device, the daemon, and the manual checks of axes.
 
 import { byId, createElement, createTable, patchTable } from "./dom.js";
 import { createAxesCheck } from "./axes_check.js";

@@ -1,4 +1,4 @@
-// The set-up page: shows one question of the gateway and sends the answer. The gateway holds the
+// The set-up page, which shows one question of the gateway and sends the answer. The gateway stores the
 // state, so a reloaded page continues. Texts are set as text, never as HTML.
 import { byId, createElement, setText } from "./dom.js";
 
@@ -78,7 +78,7 @@ function showQuestion(question, position) {
     createElement("span", { dir: "auto" }, value, text ? createElement("span", { class: "about" }, text) : null),
   ));
   const isListed = question.choices.some(({ value }) => value === question.default);
-  const postponed = options.length === 1; // only "later": a typed answer is the usual one
+  const postponed = options.length === 1; // the only option is "later", so the user usually types an answer
   const input = createElement("input", { id: "typed", type: "text", autocomplete: "off", spellcheck: "false", dir: "auto",
     value: isListed ? "" : question.default, placeholder: question.optional ? "empty: none" : null });
   const typed = createElement("label", { class: "typed" }, options.length && !postponed ? "Or type it" : "Answer", input);

@@ -1,4 +1,4 @@
-// State of the rig, from the messages below its base topic (docs/mqtt.md). Names come from a
+// State of the rig, from the messages below its base topic (docs/mqtt.md). Names are from a
 // configuration and can be any text, so they are keys of maps, never of plain objects.
 
 import { PAYLOAD_VERSION, hasForm } from "./payloads.js";
@@ -17,7 +17,7 @@ export function createStore() {
     health: null,
     calibration: null,
     progress: null,
-    /** State of the recording, with `t_us` of the gateway and `receivedMs` of the browser. */
+    /** State of the recording, with the gateway time `t_us` and the browser time `receivedMs`. */
     recording: null,
     devices: new Map(),
     lastEvents: new Map(),
@@ -34,9 +34,9 @@ export function createStore() {
     messages: 0,
     /** Topics received since the page connected. */
     received: new Set(),
-    /** Version and software of a daemon whose payloads the page cannot read; else null. */
+    /** Version and software of a daemon whose payloads the page cannot read, or null. */
     otherVersion: null,
-    /** Topic of a message that is not one of jointfitd; else null. */
+    /** Topic of a message that is not from jointfitd, or null. */
     faulty: null,
 
     /** Call `listener` after every change of a subject. */
@@ -48,7 +48,7 @@ export function createStore() {
     changed(subject) {
       for (const listener of listeners.get(subject) ?? []) listener(store);
     },
-    /** Take one message; `topic` is below the base topic. */
+    /** Process one message; `topic` is relative to the base topic. */
     take(topic, payload) {
       store.messages += 1;
       store.received.add(topic);
@@ -60,24 +60,24 @@ export function createStore() {
       if (topic === "bridge/info") store.otherVersion = null;
       takeMessage(store, topic, payload);
     },
-    /** Take the state of the recording: of a health message, or of an answer of this instant. */
+    /** Store the state of the recording, from a health message or from an answer that has just arrived. */
     takeRecording(state, t_us = gatewayNow(store)) {
       store.recording = { ...state, t_us, receivedMs: performance.now() };
       store.changed("recording");
     },
-    /** Mark the state of the daemon as unknown: the page lost its connection. */
+    /** Mark the state of the daemon as unknown, because the page lost its connection. */
     disconnected() {
       if (store.bridge === "lost") return;
       store.bridge = "lost";
       store.changed("bridge");
     },
-    /** Wait for the retained messages again: the daemon may have ended while the page was away. */
+    /** Wait for the retained messages again, because the daemon may have ended during the disconnection. */
     reconnected() {
       store.received.clear();
       Object.assign(store, { bridge: "unknown", otherVersion: null, faulty: null });
       store.changed("bridge");
     },
-    /** Forget everything that another rig or another connection might contradict. */
+    /** Discard all data that may differ for another rig or another connection. */
     reset(base) {
       Object.assign(store, {
         base, bridge: "unknown", info: null, health: null, calibration: null, progress: null, recording: null,
@@ -131,7 +131,7 @@ function takeMessage(store, topic, payload) {
 
 function takePose(store, pose) {
   const now = performance.now();
-  // An older instant is a restart of the daemon or a step of its clock: the curve begins again.
+  // An older time means a restart of the daemon or a step of its clock, so the curve begins again.
   if (store.pose && pose.t_us < store.pose.t_us) {
     store.poses.length = 0;
     store.opticals.length = 0;
@@ -145,8 +145,8 @@ function takePose(store, pose) {
   store.changed("pose");
 }
 
-// The clocks of browser and gateway may be hours apart, and drift: the smallest difference between
-// receipt and instant of the last one to two windows converts browser time to gateway time.
+// The clocks of browser and gateway may differ by hours and drift. The smallest difference between
+// receipt and time stamp in the last one or two windows converts browser time to gateway time.
 function noteClock(store, t_us, nowMs) {
   const offsetMs = nowMs - t_us / 1000;
   if (store.clock === null) store.clock = { before: offsetMs, least: offsetMs, sinceMs: nowMs };
@@ -157,13 +157,13 @@ function noteClock(store, t_us, nowMs) {
   clock.least = Math.min(clock.least, offsetMs);
 }
 
-/** Return the present UNIX time of the gateway in microseconds; null while it is unknown. */
+/** Return the current UNIX time of the gateway, µs; null if it is unknown. */
 export function gatewayNow(store) {
   if (store.clock === null) return null;
   return (performance.now() - Math.min(store.clock.before, store.clock.least)) * 1000;
 }
 
-/** Return the present duration of the recording, s. */
+/** Return the current duration of the recording, s. */
 export function recordingSeconds(store) {
   const { duration_s, t_us, receivedMs } = store.recording;
   const now_us = gatewayNow(store);
@@ -171,7 +171,7 @@ export function recordingSeconds(store) {
   return duration_s + Math.max(0, age_s);
 }
 
-/** Return the time since the last pose, ms; infinite without one. */
+/** Return the time since the last pose, ms; infinite without a pose. */
 export const poseAgeMs = (store) => (store.poseReceivedMs === null ? Infinity : performance.now() - store.poseReceivedMs);
 
 function dropOld(entries, newest_us) {
@@ -204,10 +204,10 @@ function takeDevice(store, topic, payload) {
   store.changed("devices");
 }
 
-/** Return the shown time range of the curves, s. */
+/** Return the displayed time range of the curves, s. */
 export const shownSeconds = SHOWN_S;
 
-/** Return the own value of a name in a payload; names such as "constructor" are names, too. */
+/** Return the own property of a payload; a name may be a word such as "constructor". */
 export function valueOf(table, name) {
   return table && Object.hasOwn(table, name) ? table[name] : undefined;
 }

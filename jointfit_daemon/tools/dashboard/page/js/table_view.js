@@ -15,7 +15,7 @@ export function createTableView(store) {
   byId("view-table").append(panel);
   const update = () => { if (view.visible) panel.replaceChildren(...tablesOf(store)); };
   setInterval(() => {
-    // A table that is being read or copied from is left alone.
+    // A table with the focus or a selection is not updated.
     if (!panel.contains(document.activeElement) && String(getSelection()) === "") update();
   }, INTERVAL_MS);
   view.show = (visible) => { view.visible = visible; update(); };

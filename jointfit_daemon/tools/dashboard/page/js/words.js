@@ -1,4 +1,4 @@
-// Numbers, ages and states in words. An unknown value is "–", never 0 and never an old value.
+// Conversion of numbers, ages and states to text. An unknown value is "–", never 0 and never an old value.
 
 export const UNKNOWN = "–";
 
@@ -24,19 +24,19 @@ export function formatDuration(seconds) {
   return `${Math.round(seconds / 86400)} days`;
 }
 
-/** Return a time in the past in words, in whole minutes: it does not change every second. */
+/** Return a time in the past as text in whole minutes, so the text does not change every second. */
 export function ageInWords(seconds) {
   if (seconds < 60) return "just now";
   return seconds < 90 ? "1 min ago" : `${formatDuration(seconds)} ago`;
 }
 
-/** Return a delay given in microseconds, in milliseconds or from one second on in seconds. */
+/** Return a delay, given in microseconds, as text in milliseconds, or in seconds from one second on. */
 export function formatDelay(microseconds) {
   if (microseconds >= 1e6) return formatNumber(microseconds / 1e6, 2, " s");
   return formatNumber(microseconds == null ? null : microseconds / 1000, 1, " ms");
 }
 
-/** Return a duration as hours, minutes and seconds: "0:12:04". */
+/** Return a duration in hours, minutes and seconds, such as "0:12:04". */
 export function formatStopwatch(seconds) {
   if (!Number.isFinite(seconds)) return UNKNOWN;
   const whole = Math.max(0, Math.floor(seconds));
@@ -56,16 +56,16 @@ export function formatClock(microseconds) {
   return new Date(microseconds / 1000).toLocaleTimeString([], { hour12: false });
 }
 
-/** Return a name for use inside a sentence: its writing direction does not affect the sentence. */
+/** Return a name for use within a sentence; its writing direction does not affect the sentence. */
 export const isolate = (name) => (/^[ -~]*$/.test(name) ? name : `\u2068${name}\u2069`);
 
-/** Return a name for headings: "left_knee" as "Left knee". Names of any script pass unchanged. */
+/** Return a name as a heading: "left_knee" becomes "Left knee". Other scripts remain unchanged. */
 export function titleOf(name) {
   const words = String(name).replaceAll("_", " ");
   return words.charAt(0).toUpperCase() + words.slice(1);
 }
 
-/** Return the words of an angle's key: "flexion_deg" as "flexion". */
+/** Return the name of an angle from its key: "flexion_deg" becomes "flexion". */
 export function angleName(key) {
   return key === "inner_deg" ? "inner angle" : key.replace(/_deg$/, "").replaceAll("_", " ");
 }
@@ -94,13 +94,13 @@ const FLAGS = {
 };
 const MINOR = new Set(["extrapolating", "headings_from_static", "origin_fixed", "uncorrected"]);
 
-/** Return the sentence of a flag of a pose; an unknown flag is its own text. */
+/** Return the sentence that describes a flag of a pose; return an unknown flag unchanged. */
 export function flagSentence(flag) {
   const [kind, name = ""] = flag.split(/:(.*)/s);
   return (FLAGS[kind] ?? flag).replace("%", () => isolate(name));
 }
 
-/** Return whether a flag is a remark that needs no action. */
+/** Return whether a flag requires no action. */
 export const isMinorFlag = (flag) => MINOR.has(flag.split(":")[0]);
 
 const PHASES = {
@@ -118,7 +118,7 @@ const RUNNING = new Set(["align", "static", "functional", "fitting"]);
 /** Return whether a calibration phase runs. */
 export const isRunning = (phase) => RUNNING.has(phase);
 
-/** Return the state of the calibration in words, at a UNIX time of the gateway, µs. */
+/** Return the state of the calibration as text, at a UNIX time of the gateway, µs. */
 export function calibrationSentence(calibration, now_us = null) {
   if (!calibration) return "Waiting for the calibration state";
   const { phase, version, text, kept, created_utc } = calibration;
@@ -143,12 +143,12 @@ const CLOCKS = {
   stale: ["warning", "stale"],
 };
 
-/** Return level and words of the clock quality of a device. */
+/** Return level and text of the clock quality of a device. */
 export function clockQuality(device) {
   const [level, words] = CLOCKS[device?.clock] ?? ["unknown", UNKNOWN];
   const sigma = device?.sigma_us;
   if (level !== "ok" || typeof sigma !== "number") return [level, words];
-  // Spaces that do not break: a narrow card begins a new line before the number, not inside it.
+  // With non-breaking spaces, a narrow card begins a new line before the number, not within it.
   if (sigma > 2000) return ["warning", `${words}, ±\u00a0${formatNumber(sigma / 1000, 1, "\u00a0ms")}`];
   return [level, `${words}, ±\u00a0${formatNumber(sigma, 0, "\u00a0µs")}`];
 }
