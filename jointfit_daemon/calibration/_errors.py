@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 class CalibrationError(Exception):
-    """The data do not suffice for the calibration.
+    """The data are not sufficient for the calibration.
 
     Parameters
     ----------

@@ -39,7 +39,9 @@ class WorldQuality:
     """Alignment of the world of one sensor with the optical world."""
 
     kind: str
-    """``full`` | ``heading`` (both verticals assumed correct) | ``stored``."""
+    """Kind of the alignment: ``full``, ``heading`` (both verticals are assumed to be correct) or
+    ``stored``.
+    """
     kappa: float
     """Measure of observability from 0 to 1. At 1, the rotation of the world and the
     sensor-to-segment alignment cannot be distinguished.
@@ -49,7 +51,7 @@ class WorldQuality:
     rms_rad: float
     """RMS angle between the measured and the modeled orientation of the plate."""
     lag_ns: int | None
-    """Sensor minus optical time stamp of the same event; None if not observable."""
+    """Sensor time stamp minus optical time stamp of the same event; None if not observable."""
     lag_sigma_ns: float | None
     """Standard deviation of the lag; None if unknown."""
 
@@ -120,13 +122,13 @@ class ChainQuality:
     """Number of held-out frames."""
     before: MarkerErrors | None = None
     after: MarkerErrors | None = None
-    """Errors of the model that is used."""
+    """Marker errors of the model that is used after the refinement."""
     parts: Mapping[str, PartQuality] | None = None
-    """Result for each segment of the model with refined markers."""
+    """Result by segment, for segments of the model with refined markers."""
     moved_m: Mapping[str, float] | None = None
     """Displacement of each refined marker relative to its segment."""
     stopped: str | None = None
-    """Reason for the end of the iteration."""
+    """Reason why the iteration ended."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -61,7 +61,7 @@ class OpticalTrack:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationTrial:
-    """The recording of one phase of a calibration."""
+    """Recording of one phase of a calibration."""
 
     sensors: Mapping[str, SensorTrack]
     optical: OpticalTrack | None
@@ -119,7 +119,7 @@ class CalibrationSettings:
     chain_refinement: ChainRefinement | None = None
     """Refinement of the chain model; None if it is not refined."""
     learn_online: bool = True
-    """Whether the models are refitted while the cameras see the limb."""
+    """Whether the models are refitted while the limb is visible to the cameras."""
 
     def center_method_of(self, joint: str) -> CenterMethod:
         """Return the estimator of one joint center."""

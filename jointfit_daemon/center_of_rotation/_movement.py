@@ -1,7 +1,7 @@
 """Input of the estimators: marker positions, body poses and joint angles.
 
-Positions are in meters, NaN where a marker was not visible. The poses of parent and child are given
-in the same world coordinates.
+Positions are in meters. They are NaN where a marker was not visible. The poses of parent and child
+are given in the same world coordinates.
 """
 
 from __future__ import annotations

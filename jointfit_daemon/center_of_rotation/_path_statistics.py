@@ -33,7 +33,7 @@ def variance_inflation(rho: float) -> float:
 
 
 def radial_residuals(v: Array, m: Array, w: Array) -> tuple[Array, Array]:
-    """Return radial residuals of k markers and the derivatives of the residuals by the center.
+    """Return radial residuals of k markers, and their derivatives with respect to the center.
 
     Parameters
     ----------

@@ -14,7 +14,7 @@ from math import pi
 from jointfit_daemon.model import JointAngles
 
 SPAN_NS = 50_000_000
-"""Shortest span of a difference quotient once enough frames exist, ns."""
+"""Shortest span of a difference quotient if enough frames exist, ns."""
 MAX_GAP_NS = 120_000_000
 """Longest time between two frames from which a rate is computed, ns."""
 

@@ -94,7 +94,7 @@ class ClusterPose:
     def _fit_markers(self, seen: list[Vector]) -> FittedPose | None:
         r"""Return the pose from the visible markers, with the rotation of Horn (1987).
 
-        With the largest sum :math:`\lambda` of ``y · R a``, the sum of squared residuals is
+        If :math:`\lambda` is the largest sum of ``y · R a``, the sum of squared residuals is
         :math:`\sum |a|^2 + \sum |y|^2 - 2 \lambda`.
         """
         subset = self._all
@@ -112,7 +112,7 @@ class ClusterPose:
         my = sum([y for _, y, _ in seen]) / count
         mz = sum([z for _, _, z in seen]) / count
 
-        # Cross moment of the template and the markers, and moment of the markers.
+        # Compute the cross moment of template and markers, and the moment of the markers.
         xx = xy = xz = yx = yy = yz = zx = zy = zz = squares = 0.0
         for (ax, ay, az), (x, y, z) in zip(subset.centered, seen, strict=True):
             dx, dy, dz = x - mx, y - my, z - mz

@@ -120,10 +120,10 @@ def joint_angle_estimate(
     r"""Return the angles of one joint, or None if an orientation is unknown.
 
     With isotropic errors, :math:`\Sigma_{angles} = (\sigma_1^2 + \sigma_2^2)(E^T E)^{-1}`, where E
-    maps the rates of the angles to angular velocity. To first order, the diagonal entry of the main
-    angle gives the standard deviation :math:`f \sqrt{\sigma_1^2 + \sigma_2^2}`. The factor f is
-    :math:`1 / \cos\theta` for flexion with adduction (or bending) :math:`\theta`, 1 for elevation,
-    and the factor of ``read_joint`` for a tilt.
+    maps the rates of the angles to angular velocity. To first order, the standard deviation of the
+    main angle is :math:`f \sqrt{\sigma_1^2 + \sigma_2^2}`. The factor f is :math:`1 / \cos\theta`
+    for flexion with adduction (or bending) :math:`\theta`, 1 for elevation, and the factor of
+    ``read_joint`` for a tilt.
 
     If the standard deviation of a segment about its x axis is known, it replaces the isotropic
     value in the conventions ``flexion`` and ``trunk``. In these conventions flexion hardly depends

@@ -19,7 +19,7 @@ def add_heading_sd(
 
     .. math:: \sigma^2 \leftarrow \sigma^2 + \tfrac13 \sigma_h^2 (\Delta x^2 + \Delta y^2)
 
-    Joint angles do not depend on a common heading and keep their standard deviations.
+    Joint angles do not depend on a common heading, so their standard deviations are unchanged.
     """
     sd /= sqrt(3.0)
     segments = tuple(

@@ -1,6 +1,6 @@
 """Fusion of one aligned frame of sensor orientations to the state of a limb.
 
-Invariant: the same frames in the same order give the same states. Unknown values are None, and
+Invariant: the same frames in the same order result in the same states. Unknown values are None, and
 every degradation sets a flag.
 """
 

@@ -27,7 +27,7 @@ _MOST_STEPS = 60
 the error.
 """
 _CONVERGED = 1e-16
-"""Relative step below which the root is exact to rounding."""
+"""Relative step below which only rounding errors of the root remain."""
 _LARGE = 0.2
 """Square of a component of q above which the corresponding column of the adjugate is used. The
 largest of the four squares is at least 0.25.
@@ -37,7 +37,7 @@ _Rest = tuple[float, float, float, float, float, float]
 
 
 def fit_rotation(s: tuple[Vector, Vector, Vector], bound: float) -> tuple[Quaternion, float]:
-    """Return the rotation R that maximizes the sum of ``y · R a``, and that sum.
+    """Return the rotation R that maximizes the sum of ``y · R a``, and the maximum.
 
     Parameters
     ----------

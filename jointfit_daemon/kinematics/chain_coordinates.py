@@ -39,7 +39,7 @@ _DIFFERENCE = 1e-5
 _RIDGE = 1e-12
 """Regularization that is added to G^T G, so that angles are finite at a gimbal lock."""
 _TRIED = 24
-"""Number of start angles per coordinate that an inversion tries, 15 degrees apart."""
+"""Number of start angles per coordinate in an inversion, which are 15 degrees apart."""
 _TOGETHER = 250
 """Number of instants that are compared with the start poses at once, which limits the memory."""
 _THREE_ANGLES = 3

@@ -179,7 +179,7 @@ def joint_center(parent: ClusterTrack, child: ClusterTrack, start: Array) -> Cen
     if not np.isfinite(both.center).all():
         return found
 
-    # Take center and covariance of `both` in the directions that both fits observed.
+    # Use center and covariance of `both` in the directions that both fits observed.
     kept = both.unseen.T @ both.unseen
     C = both.covariance + kept @ found.covariance @ kept
     unseen = found.unseen.T @ found.unseen

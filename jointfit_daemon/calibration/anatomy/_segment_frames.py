@@ -279,7 +279,7 @@ def place_unobserved(
     """
     whole = [joint for joint, fit in found.items() if len(fit.unseen) == 0]
     settled = {joint: found[joint] for joint in whole}
-    place = {  # run of joints above each other, and position of the joint in the run
+    place = {  # number of the run of joints, and position in the run
         chain.joints[i]: (k, at)
         for k, run in enumerate(branch_runs(chain))
         for at, i in enumerate(run)

@@ -117,13 +117,13 @@ class LiveClusters:
         self.points = y
         gap = self._fit(np.where(seen[..., None], y, 0.0), np.asarray(seen, dtype=np.float64))
 
-        # Parts with a large residual have no pose; the most deviating marker is counted.
+        # Parts with a large residual have no pose, and the marker that deviates most is counted.
         count = np.maximum(seen.sum(axis=1), 1)
         wrong = ok & (gap.sum(axis=1) / count > MAX_FIT_RMS_M**2)
         self.placed = ok & ~wrong
         self._good += self.placed
         for i in np.flatnonzero(wrong).tolist():
-            # Find the marker whose distances to the other markers changed most.
+            # Find the marker with the largest change of its distances to other markers.
             known = np.where(seen[i, :, None], y[i], 0.0)
             now, then = (
                 np.linalg.norm(x[:, None] - x[None], axis=2) for x in (known, self._template[i])
@@ -188,7 +188,7 @@ class LiveClusters:
         a_mean, y_mean = weight @ self._template / total, weight @ y / total
         a = (self._template - a_mean) * w[..., None]
 
-        # Rotation without reflection from the singular vectors of the cross moment.
+        # The singular vectors of the cross moment determine the rotation without reflection.
         U, _, Vt = np.linalg.svd(np.swapaxes(a, 1, 2) @ y)
         mirrored = np.linalg.det(U @ Vt) < 0.0
         Vt[mirrored, 2] *= -1.0

@@ -175,7 +175,7 @@ class LiveJointCenters:
         if self.joints:
             self.estimate_next()
 
-        # Unobserved directions and the standing prior need all joints together.
+        # Unobserved directions and the standing prior need the estimates of all joints.
         fits = {joint: fit for joint, (_, fit) in self._latest.items() if fit is not None}
         settled = place_unobserved(self._chain, fits)
 

@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chain, Quaternion
 
 SKIN_NOISE_M = 0.005
-"""RMS soft-tissue artefact of a skin marker, m; it limits the accuracy of a functional joint
-center."""
+"""RMS soft-tissue artefact of a skin marker, m, which limits the accuracy of a functional joint
+center.
+"""
 
 CORRELATION_S = 0.5
 """Correlation time of the soft-tissue artefact, s. One second therefore contains two independent

@@ -8,8 +8,8 @@ Nine poses determine the six parameters of bias and scale factors, with three de
 left. Twelve poses also determine the non-orthogonality. The faces of the housing need not be
 exactly perpendicular, because only magnitudes are used.
 
-Source: Frosio, Pedersini and Borghese 2009, IEEE Trans. Instrum. Meas. 58, 2034-2041; static
-detection as in Tedaldi, Pretto and Menegatti 2014, ICRA, 3042-3049.
+Source: Frosio, Pedersini and Borghese 2009, IEEE Trans. Instrum. Meas. 58, 2034-2041; the detection
+of static poses is from Tedaldi, Pretto and Menegatti 2014, ICRA, 3042-3049.
 """
 
 from __future__ import annotations
@@ -94,9 +94,9 @@ class AccelerometerEstimate:
     """Number of poses minus number of parameters."""
     poses: int
     spread_before: float
-    """RMS of the magnitudes minus g, uncorrected, m/s^2."""
+    """RMS of the uncorrected magnitudes minus g, m/s^2."""
     residual: float
-    """RMS of the magnitudes minus g, corrected, m/s^2."""
+    """RMS of the corrected magnitudes minus g, m/s^2."""
 
     def correct(self, force: Array) -> Array:
         """Return a corrected specific force, m/s^2, shape (3,)."""
@@ -114,7 +114,7 @@ def fit_accelerometer(forces: Array) -> AccelerometerEstimate:
     Raises
     ------
     SensorCalibrationError
-        Too few poses, or no plausible parameters.
+        There are too few poses, or the parameters are not plausible.
     """
     if len(forces) < FEWEST_POSES:
         raise SensorCalibrationError(
@@ -215,7 +215,7 @@ class AccelerometerStep:
         Raises
         ------
         SensorCalibrationError
-            Too few poses, saturated readings, or no plausible parameters.
+            There are too few poses, readings are saturated, or the parameters are not plausible.
         """
         missing = self._missing_faces()
         if len(self._forces) < FEWEST_POSES or len(missing) > 1:

@@ -49,7 +49,7 @@ class EllipsoidFit:
 
 
 def fit_unit_ellipsoid(vectors: Array, parameters: int) -> EllipsoidFit:
-    """Fit an ellipsoid to vectors that have approximately length 1 about 0.
+    """Fit an ellipsoid to vectors about 0 with lengths of approximately 1.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def _matrix(values: Array) -> Array:
 def matrix_sd(deviations: Array) -> Array:
     """Return standard deviations of matrix elements in the form of the matrix, shape (3, 3).
 
-    Elements that are not estimated have NaN.
+    Elements that are not estimated are NaN.
 
     Parameters
     ----------

@@ -72,9 +72,9 @@ class GyroscopeScaleEstimate:
     angle: float
     """Sum of the angles of the turns, rad."""
     spread_before: float
-    """RMS of the differences between the directions of gravity, uncorrected, rad."""
+    """RMS of the differences between the directions of gravity without correction, rad."""
     residual: float
-    """RMS of the differences between the directions of gravity, corrected, rad."""
+    """RMS of the differences between the directions of gravity after correction, rad."""
 
 
 def fit_gyroscope_scale(
@@ -93,7 +93,8 @@ def fit_gyroscope_scale(
     Raises
     ------
     SensorCalibrationError
-        Too few turns, saturated readings, or turns that do not determine the scale factors.
+        There are too few turns, readings are saturated, or the turns do not determine the scale
+        factors.
     """
     usable = [turn for turn in turns if not _is_saturated(turn)]
     if len(usable) < FEWEST_TURNS:

@@ -76,9 +76,11 @@ class MagnetometerEstimate:
     bias: Array
     """Hard-iron offset in the unit of the device, shape (3,)."""
     matrix: Array
-    """Soft iron, scale factors and non-orthogonality, symmetric, determinant 1, shape (3, 3)."""
+    """Matrix of soft iron, scale factors and non-orthogonality, shape (3, 3). It is symmetric and
+    has the determinant 1.
+    """
     bias_sd: Array
-    """Standard deviations of the offset, unit of the device, shape (3,)."""
+    """Standard deviations of the offset in the unit of the device, shape (3,)."""
     matrix_sd: Array
     """Standard deviations of the elements of the matrix, shape (3, 3)."""
     covariance: Array
@@ -89,7 +91,7 @@ class MagnetometerEstimate:
     """Number of readings minus number of parameters."""
     readings: int
     spread_before: float
-    """Standard deviation of the magnitudes relative to their mean, uncorrected."""
+    """Standard deviation of the uncorrected magnitudes relative to their mean."""
     residual: float
     """RMS of the corrected magnitudes about r, relative to r."""
     missing: tuple[str, ...]
@@ -107,7 +109,7 @@ def fit_magnetometer(fields: Array) -> MagnetometerEstimate:
     Raises
     ------
     SensorCalibrationError
-        Too few readings or directions, saturated readings, or a disturbed field.
+        There are too few readings or directions, readings are saturated, or the field is disturbed.
     """
     if len(fields) < FEWEST_READINGS:
         raise SensorCalibrationError(

@@ -23,7 +23,9 @@ RATE_SD = radians(1.0)
 FORCE_SD = 0.15
 """Largest standard deviation of a specific force at rest, m/s^2."""
 FORCE_STEP = 0.06
-"""Largest difference of the mean specific force between blocks of a rest, m/s^2: 0.35 degrees."""
+"""Largest difference of the mean specific force between blocks of a rest, m/s^2, equivalent to 0.35
+degrees.
+"""
 LONGEST_PAUSE_NS = 200_000_000
 """Longest pause between two readings of a block, ns."""
 _FEWEST = 3
@@ -74,10 +76,10 @@ class RestBlocks:
         self.rest: list[RestBlock] = []
         """Blocks of the current rest; empty during a movement."""
         self.last: RestBlock | None = None
-        """Most recent block, at rest or not."""
+        """Most recent block, at rest or in motion."""
 
     def add(self, reading: SensorReading) -> bool:
-        """Add a reading; return whether it completed a block."""
+        """Add a reading; return whether the reading completed a block."""
         readings = self._readings
         if readings and not 0 <= reading.t_ns - readings[-1].t_ns <= LONGEST_PAUSE_NS:
             readings.clear()

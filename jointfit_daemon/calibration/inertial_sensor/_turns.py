@@ -45,7 +45,7 @@ class Turn:
     t_s: Array
     """Instants of the readings, s, shape (n,)."""
     rates: Array
-    """Angular rates as measured, rad/s, shape (n, 3)."""
+    """Measured angular rates, rad/s, shape (n, 3)."""
     before: Rest
     after: Rest
 

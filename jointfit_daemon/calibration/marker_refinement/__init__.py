@@ -1,4 +1,4 @@
-"""Marker positions on their segments, refined on movements."""
+"""Refinement of marker positions on their segments from movements."""
 
 from jointfit_daemon.calibration.marker_refinement._block_descent import Carriers
 from jointfit_daemon.calibration.marker_refinement._coordinate_search import SearchSettings, search

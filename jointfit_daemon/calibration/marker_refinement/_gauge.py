@@ -38,13 +38,15 @@ class Gauge:
     """Directions of marker displacement that the data of the trials do not determine."""
 
     eigenvalues: Array
-    """Eigenvalues of S/T over the unlocked coordinates, ascending; 1 is a fully observed marker."""
+    """Eigenvalues of S/T over the unlocked coordinates in ascending order. A fully observed marker
+    has 1.
+    """
     free: int
     """Number of zero eigenvalues, which are displacements without effect on the tracking error."""
     weak: int
     """Number of non-zero eigenvalues below 0.01."""
     involved: tuple[str, ...]
-    """Markers that move along the free directions, the most displaced first."""
+    """Markers that move along the free directions, in order of decreasing displacement."""
     fixed_by: str
     """Constraint that determines the free directions: "locks", "prior" or "nothing"."""
 
@@ -70,7 +72,7 @@ def gauge_of(S: Array, frames: int, coordinates: Sequence[str], *, prior: float)
     weak = int((values < _WEAK).sum()) - free
     held = "locks" if free == 0 else "prior" if prior > 0.0 else "nothing"
 
-    # Markers whose coordinates lie most in the null space.
+    # Find the markers whose coordinates contribute most to the null space.
     shares: dict[str, float] = {}
     for name, share in zip(coordinates, (vectors[:, :free] ** 2).sum(axis=1), strict=True):
         shares[name] = shares.get(name, 0.0) + float(share)

@@ -130,8 +130,8 @@ def fit_calibration(
     Raises
     ------
     CalibrationError
-        No optical system or markers, too few visible frames, too little movement, or missing
-        sensors.
+        The optical system, markers or sensors are missing, or there are too few visible frames or
+        too little movement.
     """
     pose = static if isinstance(static, StaticPose) else fit_static(static, settings, chain)
 

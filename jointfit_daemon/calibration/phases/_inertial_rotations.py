@@ -1,4 +1,4 @@
-"""Rotations of the segments since the static pose, from their IMUs alone."""
+"""Rotations of the segments since the static pose, computed from IMUs alone."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 FEWEST = 200
 """Smallest number of new frames."""
 HELD = 0.3
-"""Newest, contiguous share of the new frames that is held out."""
+"""Fraction of the new frames, the newest, that is held out."""
 GAIN = 0.97
 """Largest ratio of the candidate's error to the error of the models in force, on held-out frames.
 """
@@ -103,7 +103,8 @@ def refit_models(
     Raises
     ------
     CalibrationError
-        Too few frames, no training frames in the calibration, or inconsistent cameras and sensors.
+        There are too few frames, the calibration has no training frames, or cameras and sensors are
+        inconsistent.
     """
     known = unpack(chain, calibration.memory)
     if known is None:

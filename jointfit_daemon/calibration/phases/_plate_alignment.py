@@ -44,7 +44,7 @@ MAX_RMS = np.deg2rad(6.0)
 plate, or swapped markers.
 """
 MAX_FRAMES = 3000
-"""Most frames that are used; longer recordings are decimated."""
+"""Largest number of frames that are used; longer recordings are decimated."""
 
 
 @dataclass(frozen=True, slots=True)

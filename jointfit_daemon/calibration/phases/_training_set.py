@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 MAX_FRAMES = 2000
-"""Most frames of one movement that are used; longer movements are decimated."""
+"""Largest number of frames of one movement that are used; longer movements are decimated."""
 MIN_FRAMES = 300
 """Smallest number of complete frames."""
 MISALIGNED = np.deg2rad(25.0)

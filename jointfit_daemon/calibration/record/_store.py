@@ -142,7 +142,7 @@ class CalibrationStore:
             except OSError as error:
                 if error.errno not in _NO_LINKS:
                     raise
-                aside.rename(self.path(version))  # FAT has no links: atomic with one writer
+                aside.rename(self.path(version))  # FAT has no links; atomic with one writer
                 return version
             else:
                 return version
@@ -174,7 +174,7 @@ class CalibrationStore:
             ) from error
 
     def latest(self) -> StoredCalibration | None:
-        """Return the newest usable version, with a note on every newer one that is unusable.
+        """Return the newest usable version, with a note on every newer version that is unusable.
 
         Files with unusable content are renamed.
 

@@ -28,7 +28,7 @@ def orientations_at(t_ns: NDArray[np.int64], q: Array, at_ns: NDArray[np.int64])
     Parameters
     ----------
     t_ns : ndarray, shape (n,)
-        Strictly increasing, ns.
+        Instants, strictly increasing, ns.
     q : ndarray, shape (n, 4)
         Unit quaternions; rows with NaN are ignored.
     at_ns : ndarray, shape (m,)

@@ -41,7 +41,7 @@ MAX_KAPPA_HEADING = 0.98
 MAX_WEAK_ERROR = np.deg2rad(1.0)
 """Largest standard error in the least observable direction of the full problem, rad."""
 _SAME = 1e-9
-"""Singular values with a smaller relative difference are equal."""
+"""Relative difference of singular values below which they count as equal."""
 
 
 @dataclass(frozen=True, slots=True)

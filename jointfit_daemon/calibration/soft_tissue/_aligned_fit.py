@@ -24,8 +24,7 @@ def fit_aligned(training: SegmentTraining) -> AlignedModel:
 
 
 def _aligned(training: SegmentTraining, sd: float) -> AlignedModel:
-    # World and sensor-to-segment alignment of each sensor, then weights from the errors of the
-    # aligned sensors.
+    # Each sensor is aligned first. The errors of the aligned sensors then determine the weights.
     found = [fit_sensor_alignment("heading", q, training.q_reference) for q in training.sensors]
     turned = [
         rotation.multiply(rotation.multiply(one.q_world, q), one.q_mount)

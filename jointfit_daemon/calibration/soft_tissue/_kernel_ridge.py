@@ -41,7 +41,7 @@ SMALLEST_SCALE = 1e-3
 not amplified.
 """
 _JITTER = 1e-6
-"""Constant added to the diagonal of a kernel matrix for a stable Cholesky decomposition."""
+"""Constant that is added to the diagonal of a kernel matrix for a stable Cholesky decomposition."""
 _HEAVY = 1e3
 """Relative weight of the row that fixes the sum of the shares."""
 _SMALLEST_SHARE = 1e-3

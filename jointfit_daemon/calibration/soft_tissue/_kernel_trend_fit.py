@@ -27,8 +27,9 @@ PENALTY = 1e-2
 """Ridge penalty of the trend."""
 
 SMALLEST_SCALE = 0.02
-"""Constant added to the RMS of each regressor, rad, so that a nearly constant regressor is not
-amplified."""
+"""Constant that is added to the RMS of each regressor, rad, so that a nearly constant regressor is
+not amplified.
+"""
 
 
 def fit_trend(u: Array, rho: Array) -> tuple[Row, Row]:

@@ -33,7 +33,7 @@ class Grid:
     """Distance between neighboring nodes, m."""
 
     def nodes(self) -> Array:
-        """Return the nodes row by row, x varying fastest, m, shape (g, 2)."""
+        """Return the nodes row by row, where x changes fastest, m, shape (g, 2)."""
         k = int(np.floor(self.half_width / self.step + 1e-9))
         ticks = self.step * np.arange(-k, k + 1)
         y, x = np.meshgrid(self.middle[1] + ticks, self.middle[0] + ticks, indexing="ij")

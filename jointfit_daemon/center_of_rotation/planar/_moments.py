@@ -73,7 +73,7 @@ def seen_places(points: Array) -> NDArray[np.bool_]:
 
 
 def moments_of(points: ArrayLike, weights: ArrayLike | None = None) -> CircleMoments[Array]:
-    """Return the moments of any number of point sets.
+    """Return the moments of point sets; the number of sets is arbitrary.
 
     Parameters
     ----------

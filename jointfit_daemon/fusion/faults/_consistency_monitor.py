@@ -137,7 +137,7 @@ class ConsistencyMonitor:
         """cos and sin of half the heading correction, by corrected sensor."""
         self._disturbances = MagneticDisturbanceDetector(chain.sensors)
         self._preceding = {n: group[:k] for group in chain.sensors for k, n in enumerate(group)}
-        """Sensors of the same segment listed before each sensor."""
+        """Sensors that are listed before each sensor of the same segment."""
         self._corrections: dict[str, Quaternion] = {}
         """Rotation of each sensor, in segment axes, that reduces the differences of its pairs."""
         self._consistent = [True] * len(chain.segments)
@@ -359,7 +359,7 @@ class ConsistencyMonitor:
     def _evaluate(self, inputs: Inputs) -> ConsistencyResult:
         spread, slipped, flags = self._evaluate_pairs(inputs)
         for inner, joint in zip(self._inner, self._joints, strict=True):
-            variance = joint.extra_variance / 3.0  # heading is one axis of three
+            variance = joint.extra_variance / 3.0  # heading is about one of three axes
             if variance:
                 for k in (inner.proximal, inner.distal):
                     spread[k] = sqrt(spread[k] * spread[k] + variance)
@@ -393,7 +393,7 @@ class ConsistencyMonitor:
         return spread, slipped, flags
 
     def _slipped_sensor(self, i: int, inputs: Inputs) -> str | None:
-        """Return the sensor that contradicts all others of its segment while they agree."""
+        """Return the sensor that contradicts all others of its segment if the others agree."""
         group = self._chain.sensors[i]
         present = [name for name in group if name in inputs] if len(group) >= MAJORITY else []
         if len(present) < MAJORITY:

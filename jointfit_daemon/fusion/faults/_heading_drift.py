@@ -25,7 +25,9 @@ BLOCK_S = 1.0
 MIN_MEASUREMENTS = 5
 """Fewest measurements in an interval with which the filter is updated."""
 RATE_SD = radians(3.0) / 60.0
-"""Standard deviation of the drift of a heading without magnetometer, rad/s: 3 degrees a minute."""
+"""Standard deviation of the drift rate of a heading without magnetometer, rad/s. It is 3 degrees
+per minute.
+"""
 RATE_S = 300.0
 """Correlation time of the drift rate, s."""
 BIAS_S = 15.0

@@ -42,7 +42,7 @@ CORRECTION_FULL = 3.2
 NEGLIGIBLE = 0.002
 """Correction below which a disturbance that ended is dropped, rad."""
 MIN_SD = 0.026
-"""Smallest standard deviation of a difference, rad: 1.5 degrees."""
+"""Smallest standard deviation of a difference, rad. It is 1.5 degrees."""
 
 
 class HeadingDifference(NamedTuple):
@@ -157,7 +157,7 @@ class MagneticDisturbanceDetector:
     ) -> tuple[dict[str, float], float]:
         targets, ambiguity = {}, 0.0
         for headings, sd in _connected_headings(edges):
-            # Every segment has the same weight, shared by its sensors.
+            # Every segment has the same weight, which is divided among its sensors.
             sizes = Counter(self._segment[name] for name in headings)
             if len(sizes) < 2:  # noqa: PLR2004 - no joint
                 continue

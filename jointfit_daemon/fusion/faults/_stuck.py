@@ -3,7 +3,7 @@
 A sensor is stuck if either
 
 * it repeats its orientation while another sensor turns, or
-* it follows less than a small share of a large rotation of its partner on the same segment.
+* it rotates by less than a small fraction of a large rotation of its partner on the same segment.
 
 A working sensor may also repeat its value, because of coarse resolution or a slow filter. The usual
 duration of such repetitions is estimated from repetitions that ended without a fault. A stuck
@@ -59,7 +59,7 @@ be smaller in two consecutive windows, because a sensor may return to its start 
 RECOVERY_NS = 200_000_000
 """Duration of movement after which a stuck sensor is used again, ns."""
 _ROUNDING = 1e-12
-"""Squared sine of half a rotation that is rounding error: 2e-6 rad."""
+"""Squared sine of half a rotation of 2e-6 rad, below which a rotation is a rounding error."""
 
 
 class _SensorHistory:
@@ -83,7 +83,7 @@ class _SensorHistory:
         """Last instant at which the sensor repeated itself."""
 
     def update(self, t_ns: int, q: Quaternion, orientations: Orientations) -> bool:
-        """Add one orientation; return whether it equals the preceding orientation."""
+        """Add an orientation; return whether it equals the preceding orientation."""
         since_ns = self.since_ns
         if since_ns is not None:
             # In most cases one component shows that the orientations differ by more than rounding.

@@ -53,7 +53,7 @@ class CoupledCurve:
         rows = np.array(path, dtype=np.float64)
         q = rows[:, 1:5]
         flips = np.cumprod(np.where((q[1:] * q[:-1]).sum(axis=1) < 0.0, -1.0, 1.0))
-        # q and -q are the same rotation; the spline requires continuous signs
+        # q and -q are the same rotation, but the spline requires continuous signs
         rows[1:, 1:5] *= flips[:, None]
         pieces = np.asarray(CubicSpline(rows[:, 0], rows[:, 1:]).c)
         return cls(rows[:, 0], pieces, rows[:, 0].tolist(), pieces.transpose(1, 2, 0).tolist())

@@ -41,7 +41,7 @@ _FEWEST_SAMPLES = 4
 
 
 class InvalidChainModelError(ValueError):
-    """Segments, joints and markers that do not form a chain; the message lists all reasons."""
+    """Segments, joints and markers do not form a chain; the message lists all reasons."""
 
 
 @dataclass(frozen=True, slots=True)

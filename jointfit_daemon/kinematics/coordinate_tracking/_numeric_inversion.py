@@ -53,7 +53,7 @@ _SMALLEST_STEP = 1e-10
 _QUARTERS = (0.0, 0.5 * np.pi, -0.5 * np.pi, np.pi)
 """Start angles of an inversion without values of a preceding instant, rad."""
 _STEEP = 0.87
-"""Start angle of the second of three rotations, rad: 50 degrees."""
+"""Start angle of the second of three rotations, rad. It is 50 degrees."""
 _MOST_ANGLES = 3
 
 

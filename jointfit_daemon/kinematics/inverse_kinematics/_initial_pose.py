@@ -23,9 +23,10 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chains import ChainModel, ChainState
 
 _SQUARINGS = 10
-"""Matrix squarings in the power iteration of the eigenvector."""
+"""Number of matrix squarings in the power iteration of the eigenvector."""
 _THIN_M2 = 1e-4
-"""Second largest moment of a marker cloud, m², below which its rotation is undetermined: (1 cm)².
+"""Second largest moment of a marker cloud, m², below which the rotation is undetermined. It is (1
+cm)².
 """
 _PULL_TO_REST = 1e-9
 """Relative weight of the rest rotation, which has an effect only along undetermined directions."""

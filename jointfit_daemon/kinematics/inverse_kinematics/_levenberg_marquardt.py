@@ -110,7 +110,7 @@ def log_matrix(R: Array) -> Array:
         axis=-1,
     )
 
-    # the length of v is the sine of the angle; near zero, angle over sine is 1
+    # the length of v is the sine of the angle; near zero, the ratio of angle to sine is 1
     sine = np.sqrt(np.einsum("...i,...i->...", v, v))
     cosine = 0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1.0)
     small = sine < 1e-9

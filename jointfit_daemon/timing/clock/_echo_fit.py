@@ -1,10 +1,10 @@
 """Server clock offset and skew from echoes (Cristian 1989; NTP's minimum-delay filter).
 
-An echo sent at a and received at b, answered with server time u, gives ``theta = u - (a + b)/2``
-with an error of at most half the round-trip time ``rho = b - a``. The echoes with round-trip times
-near the minimum are fitted by ``theta(m) = theta_0 + s (m - m_0)``: weighted least squares with
-Huber weights and a prior on the skew s, which keeps s small in the first seconds. Half the path
-asymmetry remains in theta_0; ``bound_ns`` is its limit.
+An echo is sent at host time a, answered with server time u, and received at host time b. The clock
+offset is ``theta = u - (a + b)/2``, with an error of at most half the round-trip time ``rho = b -
+a``. The echoes with round-trip times near the minimum are fitted by ``theta(m) = theta_0 + s (m -
+m_0)``: weighted least squares with Huber weights and a prior on the skew s, which keeps s small in
+the first seconds. Half the path asymmetry remains in theta_0; ``bound_ns`` is its limit.
 
 Invariant: a single wrong or forged echo does not change the fit. An echo that contradicts the fit
 is not used. If the next echo agrees with the contradicting echo, the server clock was restarted.
@@ -70,7 +70,7 @@ class EchoFit:
 
     @property
     def last_ns(self) -> int | None:
-        """Host time of the last echo; None before the first."""
+        """Host time of the last echo; None before the first echo."""
         return self._echoes[-1].middle_ns if self._echoes else None
 
     def expects_more(self, now_ns: int) -> bool:
@@ -84,7 +84,7 @@ class EchoFit:
         return sqrt(self._line.slope_var)
 
     def contradicts(self, u: int, sent_ns: int, received_ns: int) -> bool:
-        """Return whether an echo contradicts the fit by more than its own error bound."""
+        """Return whether an echo contradicts the fit by more than the error bound of the echo."""
         if not self.settled:
             return False
         middle = (sent_ns + received_ns) // 2
@@ -140,7 +140,7 @@ class EchoFit:
         return host_ns + self._theta_ref + round(theta)
 
     def host_ns(self, u: int) -> int:
-        """Return the host time of server time `u`, ns: the solution m of ``u = m + theta(m)``."""
+        """Return the host time m of server time `u`, ns, from ``u = m + theta(m)``."""
         ahead = u - self._ref - self._theta_ref
         return (
             self._ref + ahead - round((self._line.height + self.slope * ahead) / (1.0 + self.slope))

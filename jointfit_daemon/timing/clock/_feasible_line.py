@@ -7,9 +7,9 @@ sum_mean)`` with ``sum_mean = c + s mean(u)``. The maximum of the likelihood is 
 lower convex hull that straddles the mean of u (Moon, Skelly, Towsley, INFOCOM 1999; Zhang, Liu,
 Xia, INFOCOM 2002).
 
-The posterior mean under a normal prior on s has a smaller error than the maximum, and a covariance.
-Given s, c is at most ``h(s) = min(y - s u)`` and exponentially distributed below, with mean ``h(s)
-- 1/G``; the remaining integral over s is evaluated numerically.
+The posterior mean under a normal prior on s has a smaller error than the maximum. It also has a
+covariance. Given s, c is at most ``h(s) = min(y - s u)`` and exponentially distributed below, with
+mean ``h(s) - 1/G``; the remaining integral over s is evaluated numerically.
 
 Coordinates are integers, so the hull is exact.
 """
@@ -106,8 +106,9 @@ def mean_feasible_line(
     most = max(_PRIOR_TAIL * prior_sd, _WILDEST)
     edge = min(max((yb - ya) / (ub - ua), prior - most), prior + most)
 
-    # Scale of the heights above the edge, 1/G. The median height is log(2) mean heights. The two
-    # points that define the edge carry no information, and the mean costs one degree of freedom.
+    # Scale of the heights above the edge, 1/G. The median height is log(2) times the mean height.
+    # The two points that define the edge contain no information, and the mean reduces the degrees
+    # of freedom by one.
     heights = sorted(y - ya - edge * (at - ua) for at, y in points)
     count = len(heights)
     median = heights[(count + _SUPPORTS) // 2] - heights[0]

@@ -1,7 +1,7 @@
 """Robust weighted fit of a straight line.
 
-Weighted least squares with Huber weights and a zero-mean normal prior on the slope, which keeps the
-slope small while the data span is short.
+The method is weighted least squares with Huber weights. A zero-mean normal prior on the slope keeps
+the slope small while the data span is short.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 _HUBER = 1.345
-"""Huber threshold in standard deviations: 95 % efficiency for normal errors."""
+"""Huber threshold in standard deviations, with 95 % efficiency for normal errors."""
 _PASSES = 4
 """Passes of iteratively reweighted least squares."""
 
@@ -54,7 +54,7 @@ def fit_line(rows: Sequence[tuple[float, float, float]], slope_sd: float) -> Fit
             a, b, d = a + w, b + w * x, d + w * x * x
             p, q = p + w * y, q + w * x * y
 
-        # Normal equations of the slope prior, mean 0.
+        # Add the normal equations of the slope prior, whose mean is 0.
         d += 1.0 / slope_sd**2
         det = a * d - b * b
         height, slope = (d * p - b * q) / det, (a * q - b * p) / det

@@ -51,7 +51,7 @@ _LINE_POINTS = 3
 
 
 class MinimumDelayFilter:
-    """Streaming line below the points (u, y).
+    """Line below a stream of points (u, y).
 
     With a short span or few points the slope stays near its prior.
 
@@ -107,7 +107,7 @@ class MinimumDelayFilter:
         return self._y0 + round(self._c + self.skew * ahead), sigma
 
     def feed(self, u: int, y: int) -> float:
-        """Add a point with increasing `u`; return its height above the line, ns.
+        """Add a point with increasing `u`; return the height of the point above the line, ns.
 
         A point below the line lowers the line immediately, because no sample arrives before it was
         sent.

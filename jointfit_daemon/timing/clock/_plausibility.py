@@ -34,7 +34,7 @@ _INTERVAL_NS = LATE_FOR_NS // INTERVALS
 
 
 class _LateInterval(NamedTuple):
-    """Late samples of half a second."""
+    """Statistics of the late samples in half a second."""
 
     least: float
     total: float

@@ -32,8 +32,8 @@ class Stamp(NamedTuple):
 
 
 Estimate = tuple[int, float, bool, float, float]
-"""Host time, ns; skew; settled; standard deviation, ns; delay, ns. The delay is measured from the
-fastest samples or, with echoes, from the sampling instant.
+"""Tuple of host time, ns, skew, whether the clock has settled, standard deviation, ns, and delay,
+ns. The delay is measured from the fastest samples or, with echoes, from the sampling instant.
 """
 
 
@@ -59,7 +59,7 @@ class MonotonicStamps:
 
     @property
     def offset_ns(self) -> int | None:
-        """Host minus device time at the last sample, ns; None before any."""
+        """Host time minus device time at the last sample, ns; None before the first sample."""
         if self.last_t is None or self.last_u is None:
             return None
         return self.last_t - self.last_u

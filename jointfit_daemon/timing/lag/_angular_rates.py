@@ -81,7 +81,7 @@ def rates_from_orientations(
     Returns
     -------
     Rates
-        Empty if fewer than three poses are available.
+        Rates, which are empty if fewer than three poses are available.
     """
     seen = np.isfinite(q).all(axis=1)
     t = 1e-9 * np.asarray(np.asarray(t_ns)[seen] - origin_ns, dtype=np.float64)

@@ -8,10 +8,10 @@ Two rigidly connected bodies have the same angular rate up to a constant rotatio
 
 .. math:: g(t + \tau) = R\,\omega(t) + b + n ,
 
-where g and omega are in the respective body frames. The lag tau is **IMU timestamp minus mocap
-timestamp of the same event**: positive when the IMU is later. To align the systems, subtract the
-lag from the IMU timestamps. The lag contains all delays that the clocks cannot observe: constant
-transport delay, filters in both systems, and exposure conventions.
+where g and omega are in the respective body frames. The lag tau is the **IMU timestamp minus the
+mocap timestamp of the same event**, so it is positive if the IMU is later. To align the systems,
+subtract the lag from the IMU timestamps. The lag contains all delays that the clocks cannot
+observe: constant transport delay, filters in both systems, and exposure conventions.
 """
 
 from __future__ import annotations
@@ -274,7 +274,8 @@ def _best_and_rival(fits: list[LagFit], seen: LagEstimate) -> tuple[LagFit, LagF
     if all(abs(fit.tau_s - best.tau_s) <= _SAME_S for fit in alike):
         return best, None
 
-    # Whole milliseconds, because lags of equal size and opposite sign differ in their last bits.
+    # Lags are compared in whole milliseconds, because lags of opposite sign differ in their last
+    # bits.
     nearest = min(alike, key=lambda fit: (round(1e3 * abs(fit.tau_s)), fit.tau_s < 0.0))
     others = [fit for fit in alike if abs(fit.tau_s - nearest.tau_s) > _SAME_S / 2]
     return nearest, min(
@@ -366,7 +367,8 @@ def _correlations(imu: Rates, ref: Rates, step: float, reach: int) -> Floats:
     if not (a_ok.any() and b_ok.any()):
         return scores
 
-    # Sums over the common instants of every lag. Subtracting the means before limits rounding.
+    # The sums are over the common instants of every lag. The means are subtracted first, which
+    # limits rounding errors.
     a, b = (np.where(ok, x - x[ok].mean(), 0.0) for x, ok in ((a, a_ok), (b, b_ok)))
     a_on, b_on = a_ok.astype(np.float64), b_ok.astype(np.float64)
     count = np.correlate(b_on, a_on, "valid")

@@ -39,7 +39,7 @@ LEAST_PAIRS = 16
 _FIRST_HUBER = 2.4
 _TINY = 1e-12
 _BY_BIAS = -np.eye(3)
-"""Derivative of a residual by the bias."""
+"""Derivative of a residual with respect to the bias."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,8 +71,9 @@ def fit_lag(
 ) -> Generator[None, None, LagFit | None]:
     r"""Fit :math:`r_j = g(t_j + \tau) - b - R\omega_j` over (R, b, tau).
 
-    Gauss-Newton on all seven unknowns with Huber weights on |r|; the threshold is chosen by the
-    variance of the lag. The faster track is interpolated at the instants of the slower track.
+    The method is a Gauss-Newton iteration over all seven unknowns, with Huber weights on |r|. The
+    threshold with the smallest variance of the lag is selected. The faster track is interpolated at
+    the instants of the slower track.
 
     Parameters
     ----------
@@ -86,7 +87,7 @@ def fit_lag(
     Yields
     ------
     None
-        After every iteration, about a millisecond of work.
+        After every iteration, which takes about a millisecond.
 
     Returns
     -------
@@ -164,7 +165,7 @@ def _linearize(
     norm = _norms(r)
     weight = _clipped(norm, _FIRST_HUBER * _scale(norm) if clip is None else clip)
 
-    # Derivatives by rotation (the matrix of the cross product), bias and lag.
+    # Derivatives with respect to rotation (the matrix of the cross product), bias and lag.
     x, y, z = turned.T
     jacobian = np.zeros((len(r), 3, 7))
     jacobian[:, 0, 2], jacobian[:, 1, 0], jacobian[:, 2, 1] = y, z, x
@@ -184,7 +185,7 @@ def _norms(vectors: Floats) -> Floats:
 
 def _scale(norm: Floats) -> float:
     """Return the robust standard deviation per axis of residuals, from their norms."""
-    # The median of finite values, in half the time of ``np.median``.
+    # The median of finite values takes half the time of ``np.median``.
     middle = norm.size // 2
     if norm.size % 2:
         median = float(np.partition(norm, middle)[middle])
