@@ -1,11 +1,11 @@
 """Workers forked after one collection: ``pytest -p tests.forked_workers --workers 6``.
 
-A worker of pytest-xdist imports and collects thousands of tests itself. Here one process collects,
-and its forks share the modules and tests. They ask for a batch at a time. Tests that share
-fixtures of a module are in one batch, so that these are set up once.
+A worker of pytest-xdist imports and collects thousands of tests itself. Here, one process collects
+the tests, and its forks share modules and tests. A fork requests one batch at a time. Tests that
+share fixtures of a module are in one batch, so the fixtures are set up once.
 
-Invariant: every test is reported once; a test in which a worker dies fails, and the tests behind it
-run in a new worker. The worker of a test that ignores its time limit is killed.
+Invariant: every test is reported once. If a worker dies during a test, this test fails, and the
+following tests run in a new worker. If a test ignores its time limit, its worker is killed.
 """
 
 from __future__ import annotations
@@ -31,35 +31,36 @@ Batch: TypeAlias = list[int]
 """Indices of tests in the order of the collection."""
 
 LARGEST = 20
-"""Largest number of tests in a batch of those that share no fixtures."""
+"""Maximum number of tests in a batch of tests without shared fixtures."""
 CHECK_S = 1.0
 """Longest interval between two checks for tests that ignore their time limit, s."""
 WORKERS_THAT_WAIT = 2
-"""Number of workers that begin with tests in real time: they wait for half of their time."""
+"""Number of workers that begin with real-time tests, which wait for half of their time."""
 FIT_NICE = 10
-"""Decrease of the priority of a worker whose tests compute: that of a fit.
+"""Nice value of a worker whose tests compute, as for a fit.
 
-Daemons and devices in real time come first, and their fits do not wait for all other tests. A
-process cannot raise its priority again, so after the last of these tests another worker begins.
+Daemons and devices in real time thus have a higher priority, and their fits do not wait for all
+other tests. A process cannot raise its priority again, so another worker starts after the last of
+these tests.
 """
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the number of workers."""
+    """Add the option for the number of workers."""
     parser.addoption("--workers", type=int, metavar="N", help="run the tests in N forked workers")
     text = "kill the worker of a test that runs S seconds longer than its time limit"
     parser.addoption("--kill-after", type=float, metavar="S", default=60.0, help=text)
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Print no paths: the tests of all workers are reported as they end."""
+    """Print no paths, because the tests of all workers are reported as they end."""
     if config.getoption("workers") and not config.option.verbose:
         config.option.verbose = -1
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtestloop(session: pytest.Session) -> bool | None:
-    """Run the collected tests in workers; return None where pytest itself has to act."""
+    """Run the collected tests in workers; return None if pytest itself must run them."""
     workers: int | None = session.config.getoption("workers")
     if not workers or not session.items or session.testsfailed or session.config.option.collectonly:
         return None
@@ -81,16 +82,16 @@ def _marked(item: pytest.Item, *names: str) -> bool:
 
 
 def limit_s(item: pytest.Item) -> float:
-    """Return the time limit of a test: the longest tests have the longest ones."""
+    """Return the time limit of a test, s; long tests have long limits."""
     marker = item.get_closest_marker("timeout")
     return float(marker.args[0] if marker else item.config.getini("timeout"))
 
 
 def batches(items: list[pytest.Item], *, waiting: bool) -> deque[Batch]:
-    """Return the tests that wait, or all others, in batches: those with the longest limit first.
+    """Return the waiting tests or all others in batches, those with long limits first.
 
-    The tests of a file stay together if they share fixtures. Others are divided: an experiment or a
-    test with a time limit of its own is long, so it is a batch.
+    Tests of a file that share fixtures are in one batch. Other tests are divided. An experiment, or
+    a test with its own time limit, is long and therefore a batch.
     """
     chosen = [index for index, item in enumerate(items) if waits(item) is waiting]
     found: list[Batch] = []
@@ -118,15 +119,16 @@ class _Worker:
     process: ForkProcess
     channel: connection.Connection
     waiting: bool
-    """Whether it takes the tests that wait first, and then the others, instead of these alone."""
+    """Whether the worker runs the waiting tests first and then the others, instead of the others
+    only."""
     left: Batch = field(default_factory=list)
-    """Tests of its batches that it has not finished; it runs the first."""
+    """Tests that the worker has received and not finished. The first one is running."""
     began_s: float = 0.0
-    """Monotonic time at which it began the first of them."""
+    """Monotonic time at which the first of these tests started, s."""
 
 
 class _Workers:
-    """The processes, and the tests that none of them has taken."""
+    """The worker processes, and the tests that no worker has received."""
 
     def __init__(self, session: pytest.Session) -> None:
         self._session = session
@@ -165,7 +167,7 @@ class _Workers:
         self._started += 1
 
     def _serve(self, worker: _Worker) -> None:
-        """Take one message of a worker; replace a worker that has died."""
+        """Process one message of a worker; replace a worker that has died."""
         try:
             kind, content = worker.channel.recv()
         except (EOFError, ConnectionResetError):
@@ -188,7 +190,7 @@ class _Workers:
             self._config.hook.pytest_runtest_logreport(report=report)
 
     def _kill_those_that_hang(self) -> None:
-        """End a test that ignored its time limit: asyncio swallows an exception in a callback."""
+        """Kill workers whose test ignored its limit; asyncio suppresses exceptions in callbacks."""
         grace_s: float = self._config.getoption("--kill-after")
         for worker in self._workers.values():
             if worker.left:
@@ -232,8 +234,8 @@ def _work(
     nice: bool,
     inherited: list[connection.Connection],
 ) -> None:
-    """Run batches until there is none: the body of a worker."""
-    for other in inherited:  # open copies would hide the end of the first process
+    """Run batches until none remains; this is the main function of a worker."""
+    for other in inherited:  # copies would hide the end of the first process
         other.close()
     if nice:
         os.nice(FIT_NICE)
@@ -244,7 +246,8 @@ def _work(
         batch: Batch = channel.recv()
         return batch
 
-    # Fixtures that the next test needs, too, stay: it must be known before a test ends.
+    # Fixtures that the next test also needs remain, so the next test must be known before a test
+    # ends.
     indices = itertools.chain.from_iterable(iter(take, []))
     index = next(indices, None)
     while index is not None:
@@ -258,7 +261,7 @@ def _work(
 
 
 def _become_worker(config: pytest.Config, channel: connection.Connection, folder: Path) -> None:
-    """Send reports to the first process, and give the worker a folder of its own."""
+    """Send reports to the first process, and use a separate folder for the worker."""
     plugins = config.pluginmanager
     for hook in config.hook.pytest_runtest_logreport.get_hookimpls():
         if hook.plugin_name not in {"session", "logging-plugin"}:
@@ -273,7 +276,7 @@ def _become_worker(config: pytest.Config, channel: connection.Connection, folder
 
 
 class _Reporter:
-    """Sends the reports of a worker."""
+    """Plugin that sends the reports of a worker."""
 
     def __init__(self, config: pytest.Config, channel: connection.Connection) -> None:
         self._config = config

@@ -316,7 +316,7 @@ def test_file_names_are_relative_to_the_rig_file(
 def test_default_broker_is_an_address() -> None:
     example = tomllib.loads((PROJECT / "examples" / "knee.toml").read_text(encoding="utf-8"))
     for host in (MqttSettings().host, RigOptions().mqtt_host, example["mqtt"]["host"]):
-        assert ip_address(host).is_loopback  # the name may lack in /etc/hosts
+        assert ip_address(host).is_loopback  # /etc/hosts may lack the name
 
 
 anything = st.recursive(
@@ -481,7 +481,7 @@ def test_one_pass_finds_faults_in_and_across_tables(fakes: object, tmp_path: Pat
 
 
 def real_rig(**changed: Any) -> Table:
-    """Return a rig of the drivers that come with the project: one IMU on a UART, two on CAN."""
+    """Return a rig with drivers of the project: one IMU on a UART, and two on CAN."""
     xbus = {"id": "S1", "segment": "thigh", "driver": "xbus", "port": "/dev/ttyUSB0"}
     xcdi = {"segment": "shank", "driver": "xcdi", "can": "can0"}
     ids = {"sample_time": 0x105, "group_counter": 0x106, "quaternion": 0x121}

@@ -36,17 +36,17 @@ FOLDER = Path(__file__).parent
 BASE = "jointfit/endurance"
 SENSORS = ("S1", "S2", "S3", "S4")
 RATE_HZ = 400
-"""Samples per second of accelerated time of each sensor."""
+"""Sample rate of each sensor in accelerated time, Hz."""
 PERIOD_NS = 1_000_000_000 // RATE_HZ
 WAKE_S = 0.01
-"""Interval in which the sensors send what is due, s of accelerated time."""
+"""Time between two transmissions of the due samples, s of accelerated time."""
 TURN_RAD_S = 0.8
 """Angular frequency of the movement, rad/s; its amplitude is 1 rad."""
 INTERVALS = 240
 """Number of measurements of a run."""
 ERROR = "median error of poses, deg"
 MOST_ERROR_DEG = 3.0
-"""Largest median error of an interval, deg: a batch of samples arrives late by its duration."""
+"""Largest median error of an interval, deg. A batch of samples arrives late by its duration."""
 RIG = """
 [rig]
 name = "endurance"
@@ -130,7 +130,7 @@ class Movement:
 
 
 def process_values(pid: int, counts: Path) -> dict[str, float]:
-    """Return what the kernel and the process itself count."""
+    """Return the values that the kernel and the process count."""
     place = Path(f"/proc/{pid}")
     tasks, objects = struct.unpack("<qq", counts.read_bytes())
     pages = int((place / "statm").read_text("ascii").split()[1])
@@ -144,7 +144,7 @@ def process_values(pid: int, counts: Path) -> dict[str, float]:
 
 
 def daemon_values(listener: Listener, movement: Movement) -> dict[str, float]:
-    """Return what the messages of an interval contain."""
+    """Return the values in the messages of an interval."""
     poses, health = listener.poses, listener.latest["bridge/health"]
     errors = sorted(e for e in map(movement.error_deg, poses) if e is not None)
     devices = [health["devices"][name] for name in SENSORS]
@@ -164,7 +164,8 @@ async def measure(
     """Run until `samples` were received or `seconds` have passed; return the measurements."""
     movement = Movement(folder, factor)
     text = RIG.format(port=port, base=BASE, folder=folder, health_s=5)
-    # A second of real time: this machine stops processes for tenths of a second.
+    # The time limit is a second of real time, because this machine pauses processes for tenths of a
+    # second.
     line = {"folder": folder, "rate_hz": RATE_HZ, "silence_s": factor}
     text += "".join(IMU.format(name=name, **line) for name in SENSORS)
     (folder / "rig.toml").write_text(text, "utf-8")
@@ -197,7 +198,7 @@ async def measure(
                 row = {"samples": float(received(listener))}
                 row |= process_values(child.process.pid, counts)
                 row |= daemon_values(listener, movement)
-                if not any(map(math.isnan, row.values())):  # else this machine stalled
+                if not any(map(math.isnan, row.values())):  # otherwise, this machine paused
                     found.append(row)
             check_counters(listener, movement)
     finally:
@@ -243,7 +244,7 @@ def results_of(found: list[dict[str, float]], factor: int) -> dict[str, Any]:
 
 
 def faults_of(results: dict[str, Any]) -> list[str]:
-    """Return what grows or is wrong."""
+    """Return the values that grow or are wrong."""
     faults = [
         f"{name} has a slope of {slope['per_million']:+.3g} ± {slope['half_width']:.2g} per million"
         for name, slope in results["slopes"].items()
@@ -255,7 +256,7 @@ def faults_of(results: dict[str, Any]) -> list[str]:
 
 
 def main() -> int:
-    """Run, and return 1 if a value has a slope."""
+    """Run the test; return 1 if a value has a slope."""
     parser = argparse.ArgumentParser(prog="make endurance", description=__doc__)
     parser.add_argument("--samples", type=int, default=50_000_000, help="samples of all sensors")
     parser.add_argument("--factor", type=int, default=10, help="times real time")

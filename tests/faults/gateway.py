@@ -1,8 +1,8 @@
-"""A gateway for fault scenarios: simulated devices, broker, daemon and listener.
+"""Gateways for fault scenarios: simulated devices, broker, daemon and listener.
 
-There are three: two serial sensors alone; with a sensor on CAN and cameras; and in a mount
-namespace with a small disk for recordings, a clock that can be stepped and writes that can be
-delayed.
+Three gateways exist. The first has two serial sensors. The second also has a sensor on CAN and
+cameras. The third runs in a mount namespace with a small disk for recordings, a clock that can be
+stepped, and writes that can be delayed.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ REQUEST_PAUSE_S = 0.15
 
 
 def no_namespace() -> str | None:
-    """Return why this user cannot mount a file system of their own; None if they can."""
+    """Return why this user cannot mount a private file system; None if the user can."""
     command = ["unshare", "-rm", "mount", "-t", "tmpfs", "none", "/mnt"]
     if shutil.which("unshare") is None:
         return "unshare is not installed (Debian: apt install util-linux)"
@@ -103,18 +103,18 @@ def no_namespace() -> str | None:
 
 
 class Sensor:
-    """A moving IMU on a serial line, with faults that can be switched on."""
+    """A moving IMU on a serial line, with faults that a test can activate."""
 
     def __init__(self, link: Path) -> None:
         self.link, self.number = link, 0
         self.stuck_at: int | None = None
         """Number of the sample whose orientation is repeated; None while the sensor works."""
         self.resting = False
-        """Whether the sensor rests, apart from noise."""
+        """Whether the sensor rests, except for noise."""
         self.batch = 1
-        """Samples that are sent together, as an adapter with a latency timer does."""
+        """Number of samples that are sent together, as with the latency timer of an adapter."""
         self.corrupted_share = 0.0
-        """Share of messages in which one bit is wrong."""
+        """Share of messages with one wrong bit."""
         self._random = random.Random(1)
         self.device = XbusDevice(link, wire_noise=self._noise)
 
@@ -151,7 +151,7 @@ class Sensor:
 
 @dataclass
 class Gateway:
-    """The running parts, which a scenario breaks and repairs."""
+    """The running components, which a scenario disturbs and restores."""
 
     folder: Path
     broker: Broker
@@ -187,7 +187,7 @@ class Gateway:
 
     @property
     def pid(self) -> int:
-        """Number of the daemon's process."""
+        """Process id of the daemon."""
         assert self.child is not None
         assert self.child.process is not None
         return self.child.process.pid
@@ -228,24 +228,24 @@ class Gateway:
         return Path(f"/proc/{self.pid}/root{path}")
 
     def rest(self, *, resting: bool) -> None:
-        """Let the serial sensors rest or move."""
+        """Make the serial sensors rest or move."""
         for sensor in self.sensors.values():
             sensor.resting = resting
 
     def reload(self) -> None:
-        """Let the daemon load rig.toml again."""
+        """Make the daemon load rig.toml again."""
         os.kill(self.pid, signal.SIGHUP)
 
     async def request(self, name: str, **arguments: object) -> dict[str, Any]:
         """Send a request; return the answer."""
         assert self.listener.client is not None
-        # Quick scenarios in a row would exceed the ten requests a second that the daemon answers.
+        # Fast successive scenarios would exceed the limit of ten requests per second.
         await asyncio.sleep(REQUEST_PAUSE_S)
         answer: dict[str, Any] = await self.listener.client.request(name, arguments)
         return answer
 
     async def start_fit(self) -> set[int]:
-        """Begin a static phase at rest; return the processes of its fit once they run."""
+        """Start a static phase at rest; return the processes of its fit when they run."""
         self.rest(resting=True)
         await asyncio.sleep(0.5)
         answer = await self.request("calibrate", phase="static", seconds=2.0, force=True)
@@ -257,7 +257,7 @@ class Gateway:
 
     @contextlib.contextmanager
     def other_broker(self, other: Broker) -> Iterator[None]:
-        """Run another broker in place of the broker."""
+        """Replace the broker by another broker during the block."""
         self.broker.stop()
         other.start()
         try:
@@ -270,7 +270,7 @@ class Gateway:
     async def other_server(
         self, serve: Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
     ) -> AsyncIterator[None]:
-        """Serve the connections of the daemon in place of the broker."""
+        """Replace the broker by a server that serves the daemon's connections."""
         self.broker.stop()
         port = self.broker.port
         try:
@@ -280,16 +280,16 @@ class Gateway:
             self.broker.start()
 
     async def logged(self, text: str, since: int = 0) -> float:
-        """Wait for a text in the log behind its first `since` characters; return the time, s."""
+        """Wait for a text in the log after its first `since` characters; return the time, s."""
         return await self.seconds(lambda: text in self.log[since:])
 
     async def device(self, name: str) -> dict[str, Any]:
-        """Return the present counters of a device."""
+        """Return the current counters of a device."""
         found: dict[str, Any] = (await self.health())["devices"][name]
         return found
 
     async def streaming(self, name: str) -> float:
-        """Wait until a device is online and sends; return the time, s."""
+        """Wait until a device is online and sends; return the elapsed time, s."""
         began_s = time.monotonic()
         await self.listener.connected({name})
         before = self.listener.latest["bridge/health"]["devices"][name]["received"]
@@ -314,7 +314,7 @@ class Gateway:
         return time.monotonic() - began_s
 
     async def used(self, *sensors: str) -> float:
-        """Wait for a further pose with these sensors; return the time that it took, s."""
+        """Wait for another pose with these sensors; return the elapsed time, s."""
         count = len(self.listener.poses)
         return await self.seconds(
             lambda: any(
@@ -323,13 +323,13 @@ class Gateway:
         )
 
     async def seconds(self, condition: Callable[[], object]) -> float:
-        """Wait for a condition; return the time that it took, s."""
+        """Wait for a condition; return the elapsed time, s."""
         began_s = time.monotonic()
         await self.listener.until(condition)
         return time.monotonic() - began_s
 
     async def disconnected(self) -> float:
-        """Wait until the daemon knows that the broker is lost; return the time, s."""
+        """Wait until the daemon detects the loss of the broker; return the elapsed time, s."""
         began_s = time.monotonic()
         async with asyncio.timeout(30.0):
             while b"\njointfit_mqtt_connected 1" in await self._metrics():
@@ -359,7 +359,7 @@ class Gateway:
         )
 
     async def remove_old_recordings(self) -> None:
-        """Begin a new recording and delete the others: the disk is small."""
+        """Start a new recording and delete the others, because the disk is small."""
         await self.request("record", action="stop")
         folder = self.in_namespace(self.folder / "recordings")
         for path in folder.iterdir():
@@ -377,26 +377,26 @@ class Gateway:
             await writer.wait_closed()
 
     async def event(self, device: str, *parts: str) -> float:
-        """Wait for a further event; return the time that it took, s."""
+        """Wait for another event; return the elapsed time, s."""
         self.listener.events.clear()
         return await self.seconds(lambda: self.listener.find_event(device, *parts))
 
     async def health(self) -> dict[str, Any]:
-        """Return the next health message but one: all of it is of now."""
+        """Return the second health message from now; all its values are current."""
         count = self.listener.healths
         await self.listener.until(lambda: self.listener.healths > count + 1)
         found: dict[str, Any] = self.listener.latest["bridge/health"]
         return found
 
     def pose_gap_s(self, since: int) -> float:
-        """Return the longest time between instants of poses received since number `since`, s."""
+        """Return the longest time between poses received since number `since`, s."""
         t_us = [pose["t_us"] for pose in self.listener.poses[max(0, since - 1) :]]
         steps = [after - before for before, after in itertools.pairwise(t_us)]
         return max(steps, default=0) / 1e6
 
 
 def _children(pid: int) -> set[int]:
-    """Return the processes that a process has started and that run."""
+    """Return the running child processes of a process."""
     found = set()
     for path in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):

@@ -54,7 +54,7 @@ def calibration() -> Calibration:
 
 @pytest.fixture(scope="module")
 def walk() -> tuple[Motion, list[tuple[int, dict[str, Quaternion]]]]:
-    """A new movement: its truth and its aligned frames, 100 a second."""
+    """Return a new movement: its truth, and its aligned frames at 100 Hz."""
     moving = motion(SUBJECT, 15.0, 400.0)
     tracks = record(SUBJECT, moving, 31, cameras=False).sensors
     rows = {s: [tuple(q) for q in track.q_world_sensor.tolist()] for s, track in tracks.items()}
@@ -127,7 +127,7 @@ def test_standard_deviations_grow_along_the_chain_and_cover_the_errors(
         claimed = np.array([s.segments[segment].sd for s in states], dtype=float)
         error = np.radians(orientation_errors_deg(states, moving, segment))
         normalized = np.sqrt(np.mean(error**2 / (3 * claimed**2)))
-        assert normalized < 1.5  # one kind of trial: deviations are widened, so well below 1
+        assert normalized < 1.5  # one trial type; deviations are widened
 
 
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -144,7 +144,7 @@ def test_any_subset_of_sensors_gives_a_state_that_names_them(
 ) -> None:
     alive = [group for count, group in plan for _ in range(count)]
     states = play(LimbFuser(CHAIN, calibration), walk[1][: len(alive)], lambda k: alive[k])
-    missing = {0: 10**9, 1: 10**9}  # frames since a sensor of the segment was last alive
+    missing = {0: 10**9, 1: 10**9}  # frames since the last sample of a sensor of the segment
     for k, state in enumerate(states):
         for i, segment in enumerate(state.segments):
             mine = tuple(s for s in CHAIN.sensors[i] if s in alive[k])
@@ -177,7 +177,7 @@ def test_loss_and_return_of_sensors_cause_no_jump(
     )
     for segment in (0, 1):
         if set(CHAIN.sensors[segment]) <= lost:
-            continue  # held and lost: no continuity expected
+            continue  # repeated and then lost; not continuous
         assert np.max(steps_deg(parts, segment)) < np.max(steps_deg(whole, segment)) + 1.2
 
 
@@ -186,7 +186,7 @@ def test_loss_and_return_of_sensors_cause_no_jump(
 def test_one_wrong_sample_at_loss_or_return_of_a_sensor_is_not_spread(
     walk: tuple[Motion, Frames], method: Method, wrong: int
 ) -> None:
-    """A loose contact corrupts what it lets through: S2 is 24 degrees off once."""
+    """A loose contact corrupts samples: S2 has an error of 24 degrees once."""
     known, frames = calibrated_with(method), walk[1][300:400]
     lost = range(40, 44)
     alive = [ALL_SENSORS - {"S2"} if k in lost else ALL_SENSORS for k in range(len(frames))]
@@ -285,7 +285,7 @@ def test_the_same_frames_give_the_same_states(
 def test_quaternion_signs_do_not_matter(
     calibration: Calibration, walk: tuple[Motion, Frames]
 ) -> None:
-    """Random sign changes give the same states and no fault reports."""
+    """Random sign changes yield the same states and no fault reports."""
     rng = np.random.default_rng(4)
     mixed: Frames = []
     for t, said in walk[1][:600]:
@@ -335,7 +335,7 @@ def test_frame_of_four_sensors_takes_less_than_2_ms(
         began = time.thread_time_ns()
         fuser.fuse(t, t, k, orientations)
         took.append(time.thread_time_ns() - began)
-    assert np.median(took) < 2e6  # generous; the goal is 0.3 ms and bench/ measures it
+    assert np.median(took) < 2e6  # a loose limit; bench/ measures the goal of 0.3 ms
     print(f"median {np.median(took) / 1000:.0f} us per frame")
 
 
@@ -344,7 +344,7 @@ def test_sensors_on_the_plate_are_not_compared(calibration: Calibration, worn: b
     fuser = LimbFuser(CHAIN, calibration)
     fuser.worn = worn
     flags: set[str] = set()
-    for k in range(1500):  # one common movement of all sensors, which no limb performs
+    for k in range(1500):  # a common movement of all sensors, which is no limb movement
         angles = np.array([0.8 * np.sin(k / 40), 0.7 * np.sin(k / 55), k / 200])
         q = as_quaternion(Rotation.from_rotvec(angles).as_quat(scalar_first=True))
         flags |= set(fuser.fuse(k * STEP, k * STEP, k, dict.fromkeys(OWNER, q)).flags)

@@ -1,6 +1,7 @@
-"""The procedure of the patent: steps S2 to S7 as written, and nothing else.
+"""The procedure of the patent: exactly the steps S2 to S7.
 
-The oracle evaluates the equations of the patent with NumPy and SciPy from the raw sensors.
+The expected values are the equations of the patent, evaluated with NumPy and SciPy from the raw
+sensors.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 STATIC_CHAIN = replace(CHAIN, static_axes=True)
 FLAWS = Imperfections(sensor_deg=0.3, tissue_deg=6.0, heading_deg=0.0)
 SUBJECT = Subject(5, facing=0.0, flaws=FLAWS)
-"""Sensors and cameras have one world, and the subject faces +y: the patent presupposes both."""
+"""Subject who faces +y, with one world of sensors and cameras. The patent requires both."""
 COUNT = 400
 STEP_NS = 10_000_000
 SAME_DEG = 0.01
@@ -66,13 +67,13 @@ def fitted(reading: PatentReading, procedure: Procedure) -> Calibration:
 
 @cache
 def recorded() -> Frames:
-    """Return raw q_world_sensor of a movement that was not trained, (n, 4) by sensor."""
+    """Return the raw q_world_sensor of a movement without training, shape (n, 4), by sensor."""
     tracks = record(SUBJECT, motion(SUBJECT, 10.0, 400.0), 31, cameras=False).sensors
     return {name: track.q_world_sensor[:COUNT] for name, track in tracks.items()}
 
 
 def drifting(frames: Frames) -> Frames:
-    """Turn S2 by 1 deg/s about the vertical, and S4 by 25 degrees on the skin after two seconds."""
+    """Rotate S2 by 1 deg/s about the vertical, and S4 by 25 degrees on the skin after 2 s."""
     turn = Rotation.from_rotvec(np.radians(np.outer(np.arange(COUNT) * 0.01, [0.0, 0.0, 1.0])))
     slip = Rotation.from_rotvec(np.radians(np.outer(np.arange(COUNT) >= 200, [25.0, 0.0, 0.0])))
     return frames | {

@@ -41,15 +41,15 @@ CASES = 10_000_000
 OUT = Path("build/fuzz")
 PACKAGES = ["jointfit_daemon", "jointfit_drivers", "jointfit_protocols"]
 MOST_FINDINGS = 20
-"""A target with so many different findings stops."""
+"""Number of different findings after which a target stops."""
 NOT_INSTALLED = 3
 GUIDED, MUTATED = "guided", "mutated"
 GUIDED_PART = 0.2
-"""Part of the cases of a target that is guided by coverage; of the seconds it is one half."""
+"""Share of the cases of a target that coverage guides; they need half of the time."""
 ENVIRONMENT = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
 _DAY_S = 86_400.0
 _EXTRA_S = 60
-"""Processor start, imports and seeds of one target, s."""
+"""Additional time for start, imports and seeds of one target, s."""
 
 
 # --- one target, in its own process -----------------------------------------------------------
@@ -57,11 +57,11 @@ _EXTRA_S = 60
 
 @dataclass
 class Tally:
-    """What the cases of one target did so far."""
+    """Results of the cases of one target so far."""
 
     target: Target
     folder: Path
-    """Removed at the end."""
+    """Working folder, which is removed at the end."""
     most_cases: int
     until: float
     """Monotonic time of the end, s."""
@@ -78,7 +78,7 @@ class Tally:
         self.costs = ByteCosts(self.target)
 
     def case(self, data: bytes) -> None:
-        """Run one case and count it; end the process after the last one."""
+        """Run and count one case; end the process after the last case."""
         from tests.fuzz.inventory import DECODERS
         from tests.fuzz.target import run_case
 
@@ -108,13 +108,13 @@ class Tally:
             self.end()
 
     def end(self) -> None:
-        """Report and end the process: libFuzzer runs no exit handlers of Python."""
+        """Report, and end the process, because libFuzzer runs no exit handlers of Python."""
         self.report()
         shutil.rmtree(self.folder, ignore_errors=True)
         os._exit(0)
 
     def report(self) -> None:
-        """Write the result where the parent process reads it."""
+        """Write the result to the file that the parent process reads."""
         result = {
             "cases": self.cases,
             "seconds": round(time.monotonic() - self.began, 1),
@@ -128,15 +128,15 @@ class Tally:
 
 
 def serve_guided() -> None:
-    """Import everything instrumented, then fuzz one target in a fork for each line of the input.
+    """Import all modules with instrumentation, then fuzz one target per input line in a fork.
 
-    A line holds name, cases and seconds; the answer is a line with the exit code.
+    A line contains name, cases and seconds. The answer is a line with the exit code.
     """
     import atheris
 
     with atheris.instrument_imports(include=PACKAGES, enable_loader_override=False):
         from tests.fuzz import inventory  # noqa: F401 - imports all targets
-    gc.freeze()  # what the forks share is not copied to count references
+    gc.freeze()  # the forks share these objects without copies
 
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
     for line in sys.stdin:
@@ -148,7 +148,7 @@ def serve_guided() -> None:
             os.dup2(log, sys.stderr.fileno())
             try:
                 fuzz_one(name, GUIDED, int(cases), float(seconds))
-            finally:  # only after an error: a fork must not read the next line
+            finally:  # after an error, a fork must not read the next line
                 traceback.print_exc()
                 os._exit(1)
         _, status = os.waitpid(fork, 0)
@@ -156,7 +156,7 @@ def serve_guided() -> None:
 
 
 def fuzz_one(name: str, mode: str, cases: int, seconds: float) -> None:
-    """Fuzz one target in this process; does not return."""
+    """Fuzz one target in this process; the function does not return."""
     from tests.fuzz.broker_targets import folder
     from tests.fuzz.inventory import TARGETS, reproducers
 
@@ -166,7 +166,7 @@ def fuzz_one(name: str, mode: str, cases: int, seconds: float) -> None:
     for number, seed in enumerate(seeds):
         (corpus / f"seed{number}").write_bytes(seed)
 
-    # What is loaded once is not charged to a case.
+    # Modules that are loaded once do not count for a case.
     for seed in seeds:
         with contextlib.suppress(Exception):
             target.run(seed)
@@ -212,7 +212,7 @@ def shares(names: Sequence[str], whole: float) -> dict[str, float]:
 def run_target(
     name: str, cases: int, seconds: float, guided_server: subprocess.Popen[str]
 ) -> dict[str, Any]:
-    """Fuzz one target, first guided by coverage, and return the result of both parts."""
+    """Fuzz one target with and without coverage; return the result of both parts."""
     result = OUT / f"{name}.json"
     result.unlink(missing_ok=True)
     exit_code = _run_guided(name, math.ceil(GUIDED_PART * cases), seconds / 2, guided_server)
@@ -238,7 +238,7 @@ def run_target(
 
 def start_guided_server() -> subprocess.Popen[str]:
     """Start the process of `serve_guided`."""
-    with (OUT / f"{GUIDED}.log").open("ab") as log:  # lists every instrumented module
+    with (OUT / f"{GUIDED}.log").open("ab") as log:  # it lists all instrumented modules
         return subprocess.Popen(
             [sys.executable, "-m", "tests.fuzz", "--serve-guided"],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True, env=ENVIRONMENT,

@@ -69,7 +69,7 @@ TOPIC = "jointfit/fuzz/bridge/request/"
 
 @cache
 def folder() -> Path:
-    """Return a directory of this process, in memory where possible; removed at its end."""
+    """Return a temporary directory of this process, in memory if possible."""
     shm = Path("/dev/shm")
     made = Path(tempfile.mkdtemp(prefix="jointfit-fuzz-", dir=shm if shm.is_dir() else None))
     atexit.register(shutil.rmtree, made, ignore_errors=True)
@@ -81,7 +81,7 @@ def folder() -> Path:
 
 @cache
 def guards() -> tuple[RequestAuthenticator | None, ...]:
-    """Return the guards: none, and one with a key."""
+    """Return the request authenticators: none, and one with a key."""
     key_file = folder() / "request.key"
     key_file.write_bytes(KEY)
     key_file.chmod(0o600)
@@ -136,7 +136,7 @@ def seeds_request() -> list[bytes]:
 
 
 def run_rig(data: bytes) -> None:
-    """Load a rig.toml as the daemon does, and publish what it says of itself."""
+    """Load a rig.toml as the daemon does, and publish its description."""
     path = folder() / "rig.toml"
     path.write_bytes(data)
     loaded = load_rig(path)
@@ -186,7 +186,7 @@ def use_calibration(calibration: Calibration) -> None:
 
 
 def run_calibration(data: bytes) -> None:
-    """Load a stored file; use what is accepted."""
+    """Load a stored calibration; use it if it is accepted."""
     store = CalibrationStore(folder(), "fuzz")
     path = store.path(1)
     path.parent.mkdir(exist_ok=True)
@@ -195,7 +195,7 @@ def run_calibration(data: bytes) -> None:
 
 
 def run_calibration_content(data: bytes) -> None:
-    """Change a good calibration as the input says, with a valid checksum, and load it."""
+    """Change a valid calibration as the input describes, with a valid checksum; load it."""
     content = json.loads(_good_content())
     leaves = _leaves(content)
     for number in range(0, len(data) - 1, 2):
@@ -208,11 +208,11 @@ VALUES: tuple[object, ...] = (
     None, True, 0, -1, 2**63, 10**400, 0.0, 1e308, float("nan"), float("inf"), "", "x", "\ud800",
     [], [0.0] * 3, [0.0] * 4, [1.0, 0.0, 0.0, 0.0], [[]], {}, {"a": 1}, ["S1"], "thigh", 1e-300,
 )  # fmt: skip
-"""Values of every type that a damaged file may hold where another one belongs."""
+"""Values of every type that a damaged file may contain instead of the right type."""
 
 
 def _leaves(node: Any) -> list[tuple[Any, Any]]:
-    """Return every place in nested tables and lists, as the container and the key in it."""
+    """Return every leaf of nested tables and lists, as its container and its key."""
     found: list[tuple[Any, Any]] = []
     if isinstance(node, dict | list):
         pairs = node.items() if isinstance(node, dict) else enumerate(node)
@@ -267,7 +267,7 @@ def seeds_recorded_event() -> list[bytes]:
 
 
 def run_spool(data: bytes) -> None:
-    """Read a file of the spool, deliver it, and append behind it."""
+    """Read a spool file, deliver its messages, and append to it."""
     place = folder() / "spool"
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir()

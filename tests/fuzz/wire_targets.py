@@ -1,4 +1,4 @@
-"""Fuzz targets of wires: serial bytes, CAN frames and UDP datagrams, up to poses and payloads."""
+"""Fuzz targets for serial bytes, CAN frames and UDP datagrams, up to poses and payloads."""
 
 from __future__ import annotations
 
@@ -79,23 +79,24 @@ if TYPE_CHECKING:
 
 VERSIONS = ((2, 5), (2, 11), (3, 0), (3, 1), (4, 0), (4, 1), (4, 2), (0, 0), (99, 99))
 ANSWERS = (0x01, 0x0D, 0x13, 0x1D, 0x2D, 0x3E, 0x42, 0x43, 0xC1, 0xED)
-"""Xbus messages that a device sends unsolicited or as answers."""
+"""Identifiers of Xbus messages that a device sends without a request or as answers."""
 SIZES = (1, 2, 7, 40, 300, 4096)
-"""Lengths of the pieces that a stream arrives in, bytes."""
+"""Sizes of the chunks in which a stream arrives, bytes."""
 _MS = 1_000_000
 _PAUSE_EVERY = 16
 _PAUSE_NS = 700 * _MS
-"""Pause after so many chunks, ns: longer than a source may be late."""
+"""Pause after some chunks, ns. It is longer than a source may be late."""
 
 
 # --- cutting inputs ---------------------------------------------------------------------------
 
 
 def cut(data: bytes) -> Iterator[bytes]:
-    """Cut a stream in pieces whose lengths follow from its content."""
+    """Split a stream into chunks; the content of the stream determines their sizes."""
     at, state = 0, len(data) * 256 + data[0] if data else 0
     while at < len(data):
-        # A linear congruential generator: seeding `random.Random` would cost more than the case.
+        # This is a linear congruential generator, because seeding `random.Random` would cost more
+        # time than the case.
         state = (1_103_515_245 * state + 12_345) % 2**31
         size = SIZES[(state >> 16) % len(SIZES)]
         yield data[at : at + size]
@@ -103,7 +104,7 @@ def cut(data: bytes) -> Iterator[bytes]:
 
 
 def records(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Cut an input in records ``u8 kind, u8 length, payload``; the last may be short."""
+    """Split an input into records ``u8 kind, u8 length, payload``; the last one may be short."""
     at = 0
     while at + 2 <= len(data):
         kind, size = data[at], data[at + 1]
@@ -121,7 +122,7 @@ def rig() -> Rig:
 
 
 def feed_core(source: str, chunks: Iterable[bytes]) -> None:
-    """Take chunks through decoder, clock, fusion and payloads of the whole core."""
+    """Process chunks with decoder, clock, fusion and payloads of the whole core."""
     core, reporter = Core(), TopicWriter(rig(), Outbox("b/bridge/state"), UnixClock())
     t_ns = BEGIN_NS
     events: list[Event] = [Configured(t_ns, rig(), None), SourceOpened(t_ns, source)]
@@ -142,7 +143,7 @@ def feed_core(source: str, chunks: Iterable[bytes]) -> None:
 
 
 def feed_source(source: str, chunks: Iterable[bytes]) -> None:
-    """Take chunks through decoder and clock of one source, and its events to JSON."""
+    """Process chunks with decoder and clock of one source; convert the events to JSON."""
     (configured,) = (item for item in rig().sources if item.id == source)
     state = SourceState.create(configured)
     state.start()

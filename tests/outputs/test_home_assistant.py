@@ -1,7 +1,7 @@
-"""The discovery message follows the rules of Home Assistant, and its entities read our payloads.
+"""The discovery message follows the rules of Home Assistant, whose templates read our payloads.
 
-The rules are those of its documentation ("MQTT discovery", "MQTT sensor", "MQTT binary sensor",
-"MQTT button"), written down here as a JSON Schema.
+The rules are from its documentation ("MQTT discovery", "MQTT sensor", "MQTT binary sensor", "MQTT
+button"). Here, they are a JSON Schema.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def components_fixture(table: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def value(template: str, payload: object) -> str:
-    """Return what Home Assistant reads from a payload."""
+    """Return the value that Home Assistant reads from a payload."""
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, autoescape=False)
     return environment.from_string(template).render(value_json=payload)
 
@@ -168,7 +168,7 @@ def test_an_unknown_angle_is_unknown_to_home_assistant(
 ) -> None:
     flexion = components["knee_flexion"]
     assert value(flexion["value_template"], {"flexion_deg": 27.68}) == "27.68"
-    assert value(flexion["value_template"], {"flexion_deg": None}) == "None"  # its "unknown"
+    assert value(flexion["value_template"], {"flexion_deg": None}) == "None"  # "None" means unknown
 
 
 @pytest.mark.parametrize(

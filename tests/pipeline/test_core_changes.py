@@ -66,7 +66,7 @@ def accounted(bench: Bench) -> None:
 def test_rest_of_a_closed_decoder_does_not_set_the_device_online() -> None:
     bench = Bench()
     bench.feed([*opening(), *samples(SENSORS, 0, 20)])
-    # the start of a message that never ended hides a whole one until the decoder gives it up
+    # An incomplete message hides a whole message until the decoder discards the incomplete one.
     hiding = b"\xfa\xff\x36\xf0" + xbus_bytes("S1", 20)
     bench.feed([ChunkArrived("S1", Chunk(at(20), hiding)), SourceClosed(at(21), "S1", "lost", "x")])
     assert bench.devices()["S1"]["received"] == 21
@@ -135,14 +135,14 @@ def shaped(worn: dict[str, str], *, mocap: bool = False) -> dict[str, Any]:
 
 
 def still(names: Iterable[str], first: int, end: int) -> list[Event]:
-    """Return samples of sensors at rest: one orientation with increasing counters."""
+    """Return samples of sensors at rest, with constant orientation and increasing counters."""
     turning = core_feed.orientation
     with patch.object(core_feed, "orientation", lambda name, _: turning(name, 0)):
         return samples(names, first, end)
 
 
 def calibrated_by_standing(rig_table: dict[str, Any]) -> tuple[Bench, Calibration]:
-    """Stand still without mocap; return the core and the result of the worker."""
+    """Simulate standing without mocap; return the core and the result of the worker."""
     rig, bench = parse_rig(rig_table), Bench()
     names = [source.id for source in rig.sources]
     bench.feed([Configured(BEGIN_NS, rig, None), *(SourceOpened(BEGIN_NS, n) for n in names)])
@@ -238,7 +238,7 @@ def test_reload_keeps_chain_tracking_and_running_centers_whose_configuration_is_
         return bench.core._chain_tracker, bench.core._moving_centers
 
     def reload(number: int) -> tuple[object, object]:
-        # an equal object each time, as after another reading of the stored file
+        # Make an equal object each time, as after reading the stored file again.
         calibration = Calibration.from_dict(plain_calibration(parse_rig(rig).chain).to_dict())
         bench.feed([Configured(at(number), parse_rig(rig), calibration)])
         assert None not in state()
@@ -256,7 +256,7 @@ def test_reload_keeps_chain_tracking_and_running_centers_whose_configuration_is_
 
 
 def reconnected(after: Iterable[Event]) -> tuple[Bench, list[Notice]]:
-    """Return a core whose S3 was away for two seconds, and its notices about restarts."""
+    """Return a core whose S3 was disconnected for two seconds, and its restart notices."""
     bench, _ = calibrated_by_standing(shaped({"S1": "thigh", "S3": "shank"}))
     begin = len(bench.out)
     bench.feed([SourceClosed(at(721), "S3", "lost", "unplugged"), SourceOpened(at(922), "S3")])
@@ -278,7 +278,7 @@ def test_reconnect_without_restart_preserves_the_pose() -> None:
 
 
 def test_counter_that_stood_still_while_disconnected_is_no_restart() -> None:
-    """A device that is being configured counts no samples, and its time goes on."""
+    """During configuration, a device counts no samples, but its time continues."""
     with patch.object(core_feed, "counter", lambda number: number - 60):
         after = samples(["S3"], 922, 960)
     bench, notices = reconnected(after)

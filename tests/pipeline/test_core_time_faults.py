@@ -46,16 +46,16 @@ NS = 1_000_000_000
 TICK_NS = 100_000
 WRAP = 2**32
 BOOTED_NS = -1_000 * NS
-"""Devices count from here: a thousand seconds before the run."""
+"""Start time of the device clocks, ns: a thousand seconds before the run."""
 FAULT, COUNT = 400, 1_200
-"""Samples until it happens, and in all: four seconds before, eight after."""
+"""Number of samples before the fault (four seconds) and of the run (twelve seconds)."""
 RECOVERY_NS = 6 * NS
 VERDICTS = ("used", "decimated", "idle", "late", "duplicate", "dropped")
 
 
 @dataclass
 class Sent:
-    """One sample as a device sends it; a fault changes fields before it is written."""
+    """One sample of a device; a fault changes its fields before it is written."""
 
     name: str
     number: int
@@ -95,7 +95,7 @@ class Sent:
 
 
 class TimeFaultCore(Core):
-    """The core with access to its frames: uncalibrated states name no sensor."""
+    """Core that provides its frames, because uncalibrated states name no sensor."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -113,13 +113,13 @@ class Lived:
 
     states: list[LimbState]
     frames: list[AlignedFrame]
-    """One a state."""
+    """Frames, one per limb state."""
     notices: list[Notice]
     devices: dict[str, Any]
     fault_ns: int
 
     def between(self, begin_ns: int, end_ns: int) -> list[tuple[str, AlignedFrame]]:
-        """Return the sync words and frames that went out in that time after the fault."""
+        """Return sync states and frames that were output in this time after the fault."""
         return [
             (state.sync, frame)
             for state, frame in zip(self.states, self.frames, strict=True)
@@ -139,9 +139,9 @@ def live(
     count: int = COUNT,
     untimed: str = "",
 ) -> Lived:
-    """Run four sensors; `fault` may change, or lose, every sample from number FAULT on.
+    """Run four sensors; `fault` may change or drop every sample from number FAULT on.
 
-    A CAN sensor that is `untimed` has a counter and no clock.
+    A CAN sensor that is `untimed` has a counter but no clock.
     """
     events: list[Event] = list(more)
     for name in SENSORS:
@@ -168,7 +168,7 @@ def live(
 
 
 def assert_sane(run: Lived) -> None:
-    """Whatever happened: order, one verdict a sample, nothing out of thin air."""
+    """Assert ordered frames and exactly one outcome for each sample."""
     assert all(a.t_ns < b.t_ns for a, b in itertools.pairwise(run.states))
     assert all(a.completed_ns <= b.completed_ns for a, b in itertools.pairwise(run.states))
     assert [state.seq for state in run.states] == list(range(1, len(run.states) + 1))
@@ -179,7 +179,7 @@ def assert_sane(run: Lived) -> None:
 
 
 def assert_healed(run: Lived, after_ns: int = RECOVERY_NS) -> None:
-    """Frames are complete, on time and synced again, all by themselves."""
+    """Assert that frames become complete, timely and synced again without help."""
     healed = run.between(after_ns, 60 * NS)
     assert len(healed) > 100
     assert {sync for sync, _ in healed} == {"locked"}
@@ -194,7 +194,7 @@ def told(run: Lived, name: str) -> list[str]:
 
 
 def rebooted(sent: Sent) -> Sent | None:
-    """Power fails for a second; clock and counter begin at nothing."""
+    """Return the sample after a power failure of a second; clock and counter restart."""
     if sent.name != "S3":
         return sent
     if sent.number < FAULT + 100:
@@ -232,7 +232,7 @@ def test_device_clock_jump_is_reported_and_settles_again(jump_s: float) -> None:
 
 @pytest.mark.parametrize("asleep_s", [0.5, 30.0, 7_200.0])
 def test_all_clocks_settle_again_after_suspend(asleep_s: float) -> None:
-    """CLOCK_MONOTONIC stands still in suspend; the devices count on."""
+    """CLOCK_MONOTONIC stops during suspend, but the device clocks continue."""
 
     def slept(sent: Sent) -> Sent:
         sent.device_ns += round(asleep_s * NS)
@@ -247,7 +247,7 @@ def test_all_clocks_settle_again_after_suspend(asleep_s: float) -> None:
 
 
 def test_all_clocks_settle_again_after_suspend_with_lost_ports() -> None:
-    """As after a real suspend: drivers see a loss and come back a second later."""
+    """As after a real suspend, drivers detect a loss and reconnect a second later."""
 
     def slept(sent: Sent) -> Sent | None:
         sent.device_ns += 3_600 * NS
@@ -265,7 +265,7 @@ def test_all_clocks_settle_again_after_suspend_with_lost_ports() -> None:
 
 
 def test_stall_of_the_host_starts_no_new_epoch() -> None:
-    """Half a second without CPU: everything arrives at once, with right device times."""
+    """After half a second without CPU, all samples arrive at once, with right device times."""
 
     def delayed(sent: Sent) -> Sent:
         until_ns = BEGIN_NS + (FAULT + 50) * PERIOD_NS
@@ -282,7 +282,7 @@ def test_stall_of_the_host_starts_no_new_epoch() -> None:
 def test_repeated_stamps_are_duplicates_without_effect_on_frames() -> None:
     def repeated(sent: Sent) -> Sent:
         if sent.name == "S1" and sent.number % 10 == 0:
-            sent.device_ns -= PERIOD_NS  # the time of the sample before
+            sent.device_ns -= PERIOD_NS  # the time of the previous sample
         return sent
 
     def twice(sent: Sent) -> Sent:
@@ -379,7 +379,7 @@ troubles = st.lists(
 )
 
 
-@pytest.mark.timeout(120)  # ten seconds where nothing else runs
+@pytest.mark.timeout(120)  # ten seconds on an idle machine
 @settings(max_examples=6)
 @given(troubles)
 def test_recovery_from_any_sequence_of_time_faults(

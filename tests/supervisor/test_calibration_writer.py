@@ -1,4 +1,4 @@
-"""Writing of calibrations: in sequence, off the loop, consistent with a reload."""
+"""Writing of calibrations: in sequence, outside the event loop, consistent with a reload."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def calibration_of(rig: Rig, note: str = "") -> Calibration:
 
 
 class SlowDisk:
-    """Writes when it is told to go on; counts who writes at the same time."""
+    """Disk that writes on command, and counts simultaneous writes."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.go = threading.Event()
@@ -79,7 +79,7 @@ async def test_two_calibrations_are_written_one_after_the_other(
         await runner.settle()
     assert disk.most == 1
     assert complaints == []
-    # the first one was not in force any more when it was written
+    # The first calibration was no longer active when it was written.
     assert [event.version for event in events if isinstance(event, CalibrationStored)] == [2]
     found = runner.load(rig).calibration
     assert found is not None
@@ -108,7 +108,7 @@ async def test_unwritten_calibration_stays_in_force_over_a_reload(
 
 
 class ReadyCore:
-    """Hands out a calibration when asked, and keeps what it is configured with."""
+    """Core that returns a calibration on request, and stores its configuration."""
 
     next_deadline_ns = None
     stages: StageObserver | None = None
@@ -155,7 +155,7 @@ async def test_an_unwritable_store_is_reported_at_the_start_like_the_state_direc
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
     store = tmp_path / "calibrations" / rig.calibration_store
     store.parent.mkdir()
-    store.write_text("")  # a file in the place of the folder
+    store.write_text("")  # a file with the name of the folder
     running = asyncio.create_task(
         Daemon(tmp_path / "rig.toml", rig, ReadyCore(calibration_of(rig, "new"))).run()
     )
@@ -205,7 +205,7 @@ async def test_an_unwritable_state_is_reported_at_the_start_and_the_result_store
 
 @contextlib.contextmanager
 def full_disk() -> Iterator[None]:
-    """Let no file grow beyond 1000 bytes: the kernel refuses the rest, as on a full disk."""
+    """Limit files to 1000 bytes; the kernel refuses the rest, as on a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
     try:
@@ -287,7 +287,7 @@ async def test_failed_write_is_retried(rig: Rig, monkeypatch: pytest.MonkeyPatch
     ],
 )
 def test_calibration_age_is_zero_if_unknown(created: str, age_s: float) -> None:
-    """A host without a clock of its own may think it is yesterday."""
+    """On a host without a real-time clock, the date may be wrong."""
     now = datetime.datetime(2026, 3, 1, 11, tzinfo=datetime.UTC)
     calibration = Calibration("mean", (), (), (), {}, {}, {}, created_utc=created)
     assert _calibration_store.calibration_age_s(calibration, now) == age_s

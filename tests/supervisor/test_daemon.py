@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 
 
 class RecordingCore:
-    """Keeps what it is fed and answers from a script."""
+    """Core that stores its input and answers from a script."""
 
     def __init__(self) -> None:
         self.events: list[Event] = []
@@ -87,7 +87,7 @@ class RecordingCore:
 
 
 def small(table: dict[str, Any], port: int, **moods: str) -> dict[str, Any]:
-    """Return a rig of the two plain fakes, one a segment."""
+    """Return a rig of the two plain simulated drivers, one on each segment."""
     imus = [imu | {"mood": moods.get(imu["id"], "well")} for imu in table["imu"][:2]]
     imus[1]["segment"] = "shank"
     return {
@@ -99,7 +99,7 @@ def small(table: dict[str, Any], port: int, **moods: str) -> dict[str, Any]:
 
 
 def toml(table: dict[str, Any]) -> str:
-    """Write `table`, of tables of plain values and one list of tables, as TOML."""
+    """Return `table`, which has tables of plain values and one list of tables, as TOML."""
     lines = []
     for name, part in table.items():
         for section in part if isinstance(part, list) else [part]:
@@ -140,7 +140,7 @@ async def until(condition: Callable[[], bool], within_s: float = 8.0) -> None:
 
 
 class Script:
-    """A driver whose every run does the next thing on its list."""
+    """Driver whose runs perform the actions of a list, one after another."""
 
     steps: list[Any]
 
@@ -401,7 +401,7 @@ async def test_a_run_of_the_real_core_gives_poses_and_health(
     assert health["process"]["rss_bytes"] > 1e6
     assert health["link"]["connected"] is True
     assert health["latency"].pop("frames") > 0
-    # nothing was decoded for frames that were all released at their deadline
+    # No frame has a decoding time, because all frames were released at their deadline.
     stages = {name: stage for name, stage in health["latency"].items() if stage is not None}
     assert all(stage["p50"] <= stage["p99"] <= stage["max"] for stage in stages.values())
     assert stages["written_us"]["max"] <= stages["total_us"]["max"]
@@ -415,7 +415,7 @@ async def test_a_receiver_of_lsl_gets_the_frames_of_the_daemon(
     broker: Broker,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(gc, "freeze", lambda: None)  # frozen outlets keep their sockets
+    monkeypatch.setattr(gc, "freeze", lambda: None)  # frozen objects would keep their sockets open
     rig = small(table, broker.port) | {"lsl": {"name": f"daemon {os.getpid()}"}}
 
     def pull() -> tuple[list[str], list[float], list[float], float]:
@@ -486,20 +486,20 @@ async def test_systemd_receives_ready_watchdog_status_and_stopping(
     monkeypatch.delenv("WATCHDOG_PID", raising=False)
     async with daemon(small(table, free_port(), S1="lost"), tmp_path, RecordingCore()):
         words = []
-        for number in range(20):  # the queue of a datagram socket holds ten
+        for number in range(20):  # the queue of a datagram socket has ten entries
             await asyncio.sleep(0.1)
             words += heard(notified)
             if number == 12:
                 os.kill(os.getpid(), signal.SIGHUP)
     words += heard(notified)
-    assert words[0].startswith("STATUS=")  # what is known is told with it
+    assert words[0].startswith("STATUS=")  # the message contains the known status
     assert words[1] == "READY=1"
     assert words.count("WATCHDOG=1") >= 3
     assert any(word.startswith("STATUS=0 of 2 IMUs, missing S1, S2") for word in words)
     assert any(word.startswith("RELOADING=1\nMONOTONIC_USEC=") for word in words)
     assert words.count("READY=1") == 2
     after = words[words.index("STOPPING=1") + 1 :]
-    assert set(after) <= {"WATCHDOG=1"}  # a stop that takes its time is still alive
+    assert set(after) <= {"WATCHDOG=1"}  # a slow stop also triggers the watchdog
 
 
 async def test_unresponsive_systemd_does_not_block_the_loop(
@@ -535,10 +535,10 @@ def counters(received: int, states: int, late: int = 0) -> CoreHealth:
 
 def test_watchdog_trips_only_if_samples_produce_no_state() -> None:
     progress = ProgressMonitor()
-    assert progress.has_progressed(counters(0, 0))  # nothing arrives
-    assert progress.has_progressed(counters(10, 5))  # states come
-    assert progress.has_progressed(counters(20, 5, late=10))  # arrives, too late for any state
-    assert not progress.has_progressed(counters(40, 5, late=10))  # arrives, and nothing comes of it
+    assert progress.has_progressed(counters(0, 0))  # no sample arrives
+    assert progress.has_progressed(counters(10, 5))  # states are output
+    assert progress.has_progressed(counters(20, 5, late=10))  # too late for any state
+    assert not progress.has_progressed(counters(40, 5, late=10))  # no output results
     assert progress.has_progressed(counters(60, 6, late=10))
     assert progress.has_progressed(CoreHealth(frames=FrameCounts(9, 3, 0)))
 
@@ -547,7 +547,7 @@ def test_watchdog_trips_only_if_samples_produce_no_state() -> None:
 
 
 def broken_job() -> FitJob:
-    """Return a job that fails: it has no trial."""
+    """Return a job that fails because it has no trial."""
     chain = Chain(("hip", "knee"), ("thigh",), (("S1",),))
     return FitJob(1, StaticJob(chain, CalibrationSettings(), cast("CalibrationTrial", None)))
 

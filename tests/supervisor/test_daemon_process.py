@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 PROJECT = Path(__file__).resolve().parents[2]
 PATIENCE_S = 60.0
-"""Time limit for a step that takes a second on an idle machine, s."""
+"""Time limit for a step, s. On an idle machine, a step takes a second."""
 
 pytestmark = pytest.mark.system
 
@@ -70,7 +70,7 @@ port = {port}
 
 
 class Process:
-    """One jointfitd with the fake drivers installed."""
+    """One jointfitd process with the simulated drivers installed."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -211,7 +211,7 @@ def test_a_second_daemon_in_one_state_directory_ends_with_exit_code_3(process: P
         assert first.poll() is None
         first.kill()
         first.wait()
-    with running(process) as third:  # no stale lock
+    with running(process) as third:  # the lock is released
         time.sleep(1)
         assert third.poll() is None
 

@@ -1,4 +1,4 @@
-"""Every request does what docs/mqtt.md says, once, and a faulty one changes nothing.
+"""Every request has the effect in docs/mqtt.md, once; a faulty request has no effect.
 
 The faulty requests are generated from the JSON Schemas of the arguments.
 """
@@ -58,7 +58,7 @@ WRONG: dict[str, tuple[Any, ...]] = {
     "integer": ("5", 1.5, [], None),
     "boolean": ("true", 1, None),
 }
-"""Values of other types, by JSON type."""
+"""Values of other types, for each JSON type."""
 
 
 def faulty(name: str) -> Iterator[tuple[dict[str, Any], str]]:
@@ -181,7 +181,7 @@ async def test_a_repeated_request_gets_the_same_answer_and_changes_nothing(
             first = await gateway.ask(name, asked)
             assert first.status in ("ok", "accepted"), first
             ANSWERS[name].model_validate(first.data)
-            await asyncio.sleep(0.05)  # a new calibration is stored
+            await asyncio.sleep(0.05)  # the new calibration is stored meanwhile
             before = gateway.state()
             assert await gateway.ask(name, asked) == first
             assert gateway.state() == before
@@ -354,7 +354,7 @@ async def test_a_revert_waits_until_the_calibration_in_force_has_its_number(
 
     def save_and_wait(*words: Any, **more: Any) -> int:
         version = save(*words, **more)
-        time.sleep(0.2)  # the file is there, and the daemon does not know it yet
+        time.sleep(0.2)  # the file exists, but the daemon has not detected it
         return version
 
     monkeypatch.setattr(_calibration_store, "save", save_and_wait)

@@ -1,7 +1,8 @@
 """A complete gateway for tests: simulated devices, the daemon process, and an MQTT listener.
 
-Retained messages overtake queued events, and events overtake queued poses and health messages. A
-test that has waited for one message therefore waits for each other message that it asserts.
+Retained messages can arrive before queued events, and events before queued poses and health
+messages. A test that has waited for one message therefore waits for each other message that it
+checks.
 """
 
 from __future__ import annotations
@@ -43,23 +44,23 @@ TOPICS = (
     "device/+/availability",
 )  # fmt: skip
 RECONNECT_S = 0.1
-"""Pause of the listener before it connects again, s."""
+"""Time before the listener connects again, s."""
 PATIENCE_S = 60.0
-"""Time limit for a message that arrives within 3 s on an idle machine, s."""
+"""Time limit for a message, s. On an idle machine, it arrives within 3 s."""
 FIT_PATIENCE_S = 150.0
-"""Time limit for a fit, s: it takes 10 s on an idle machine, and its process has a low priority."""
+"""Time limit for a fit, s. It needs 10 s on an idle machine, and its process has a low priority."""
 
 
 def broker(port: int, base: str = BASE) -> MqttSettings:
-    """Return the settings of a client of the test's broker."""
+    """Return the settings of a client for the test's broker."""
     return MqttSettings(host=HOST, port=port, base=base)
 
 
 def load_factor() -> float:
     """Return the factor by which the load of this machine slows a process down, at least 1.
 
-    It is the number of runnable processes per core. Time limits that belong to a claim about the
-    daemon hold on an idle machine and are multiplied by this factor.
+    The factor is the number of runnable processes per core. Time limits of a claim about the daemon
+    apply to an idle machine and are multiplied by this factor.
     """
     return max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
 
@@ -121,11 +122,11 @@ class Listener:
         return None
 
     def format_events(self) -> str:
-        """Return all events, one a line, for the messages of failed assertions."""
+        """Return all events, one per line, for the messages of failed assertions."""
         return "\n".join(f"{e['level']} {e['kind']} {e['id']}: {e['text']}" for e in self.events)
 
     async def until(self, condition: Callable[[], object], within_s: float = PATIENCE_S) -> None:
-        """Wait for a condition; a failure lists the events."""
+        """Wait for a condition; the error message lists the events."""
         try:
             async with asyncio.timeout(within_s):
                 while not condition():
@@ -154,13 +155,13 @@ class Listener:
     async def more_poses(
         self, count: int = 20, within_s: float = PATIENCE_S
     ) -> list[dict[str, Any]]:
-        """Wait for `count` further poses; return exactly these."""
+        """Wait for `count` more poses; return exactly these poses."""
         before = len(self.poses)
         await self.until(lambda: len(self.poses) >= before + count, within_s)
         return self.poses[before : before + count]
 
     async def poses_after(self, t_us: int, count: int = 1) -> list[dict[str, Any]]:
-        """Wait for `count` poses of instants after `t_us` (UNIX time, µs); return exactly these."""
+        """Wait for `count` poses later than `t_us` (UNIX time, µs); return exactly these poses."""
 
         def later() -> list[dict[str, Any]]:
             return [pose for pose in self.poses[-20 * count :] if pose["t_us"] > t_us]
@@ -171,7 +172,7 @@ class Listener:
     async def health(
         self, condition: Callable[[dict[str, Any]], object] = lambda _: True
     ) -> dict[str, Any]:
-        """Wait for a further health message whose devices meet `condition`; return its devices."""
+        """Wait for another health message whose devices meet `condition`; return its devices."""
         before = self.healths
         await self.until(
             lambda: self.healths > before and condition(self.latest["bridge/health"]["devices"])
@@ -180,7 +181,7 @@ class Listener:
         return devices
 
     async def final_health(self) -> dict[str, Any]:
-        """Return the devices of a health message in which all are offline and no sample waits."""
+        """Return the devices of a health message with all offline and no waiting samples."""
         await self.until(lambda: not self.online)
         return await self.health(
             lambda devices: not any(d["online"] or d["pending"] for d in devices.values())
@@ -230,9 +231,9 @@ class Station:
     port: int
     options: tuple[str, ...] = ()
     more_toml: str = ""
-    """Appended to the rig.toml of the simulator."""
+    """Text that is appended to the rig.toml of the simulator."""
     mqtt_toml: str = ""
-    """Added to its table ``[mqtt]``."""
+    """Text that is added to the table ``[mqtt]``."""
 
     @property
     def rig(self) -> Path:
@@ -245,7 +246,7 @@ class Station:
         return (self.folder / "daemon.log").read_text("utf-8", "replace")
 
     def write_rig(self, *changes: tuple[str, str]) -> None:
-        """Write the rig of the daemon: that of the simulator with each (old, new) replaced once."""
+        """Write the daemon's rig: the simulator's rig with each (old, new) replaced once."""
         text = (self.folder / "rig.toml").read_text(encoding="utf-8") + self.more_toml
         text = text.replace("[mqtt]\n", f"[mqtt]\nhealth_s = 0.5\n{self.mqtt_toml}")
         for old, new in changes:
@@ -271,7 +272,7 @@ class Station:
 
 @contextlib.asynccontextmanager
 async def in_this_process(scene: Scene) -> AsyncIterator[None]:
-    """Run simulated devices in this process, where a test can change them; raise their errors."""
+    """Run simulated devices in this process, so a test can change them; raise their errors."""
     ready = asyncio.Event()
     task = asyncio.create_task(scene.run(lambda _: ready.set()), name="scene")
     try:
@@ -310,19 +311,19 @@ async def stopped(
 
 
 def restore_signals() -> None:
-    """Reset the handlers of stop signals in a child process: nohup and `&` ignore signals."""
+    """Reset the stop signals of a child process, because nohup and `&` ignore signals."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
 
 
 def hang_up(daemon: ChildProcess) -> None:
-    """Send SIGHUP: the daemon reloads its rig."""
+    """Send SIGHUP, so the daemon reloads its rig."""
     assert daemon.process is not None
     daemon.process.send_signal(signal.SIGHUP)
 
 
 def unbalanced(devices: dict[str, Any]) -> dict[str, dict[str, int]]:
-    """Return the counters of devices whose outcomes do not add up, or with pending samples."""
+    """Return the counters of devices with pending samples or with a wrong sum of outcomes."""
     return {
         name: {key: device[key] for key in ("received", *OUTCOMES, "pending")}
         for name, device in devices.items()
@@ -331,7 +332,7 @@ def unbalanced(devices: dict[str, Any]) -> dict[str, dict[str, int]]:
 
 
 def store_calibration(rig_file: Path, state: Path) -> None:
-    """Store a static calibration of sensors whose axes are those of their segments."""
+    """Store a static calibration of sensors that are aligned with their segments."""
     rig = load_rig(rig_file)
     t_ns = np.arange(400, dtype=np.int64) * 10_000_000
     still = np.tile((1.0, 0.0, 0.0, 0.0), (len(t_ns), 1))

@@ -1,6 +1,6 @@
 """Payloads, log and replay of a run with calibration, reconnection and reload.
 
-The run takes most of a minute, so it is made once for all subtests.
+The run takes most of a minute, so all subtests use the same run.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(300)]
 
 SETTLE_S = 1.7
-"""A motion blends into the next for 1.5 s; s."""
+"""Time after a change of motion, s. Two motions are blended for 1.5 s."""
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "mqtt.md"
 TOPICS = (
     "pose/ui", "optical/pose", "optical/chain", "optical/centers", "sensors/pose", "joint/+",
     "calibration/progress", "bridge/log", "device/+/info",
 )  # fmt: skip
-"""Topics beside those of the listener."""
+"""Topics in addition to the topics of the listener."""
 NAMES = {
     *SENSORS, *(f"{a}{mark}{b}" for a in SENSORS for b in SENSORS for mark in "~+"),
     "mocap", "hip", "knee", "ankle", "thigh", "shank", "pelvis", "foot", "shank_angle",
@@ -63,7 +63,7 @@ class CalibratedRun:
     chain: list[dict[str, Any]]
     """Payloads of `optical/chain`."""
     misfits: dict[str, str]
-    """Last fault of a payload against its model, by topic."""
+    """Last difference between a payload and its model, by topic."""
 
 
 async def calibrated_run(folder: Path, port: int) -> CalibratedRun:
@@ -166,7 +166,7 @@ def keys_of_examples() -> set[str]:
     """Return the keys in the page's examples of payloads."""
     text = PAGE.read_text(encoding="utf-8")
     examples = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
-    examples = [body for body in examples if '"sticks"' not in body]  # that of another rig
+    examples = [body for body in examples if '"sticks"' not in body]  # of another rig
     return set(re.findall(r'"(\w+)":', " ".join(examples))) - NAMES
 
 
@@ -238,7 +238,7 @@ def judge_the_chain_model(run: CalibratedRun) -> None:
     assert 4 < rate_hz <= 10.5
     assert run.chain[-1]["fit"]["rms_m"] < 0.02
 
-    # the calibration refines the markers, and the reload finds them in its file
+    # The calibration refines the markers, and the reload reads them from its file.
     refined = [payload["refined"] for payload in run.chain]
     assert refined == sorted(refined)
     errors = {kind: [p["fit"]["rms_m"] for p in run.chain if p["refined"] is kind and p["fit"]]
@@ -251,7 +251,7 @@ def judge_the_chain_model(run: CalibratedRun) -> None:
     assert figures["after"]["rms_m"] < figures["before"]["rms_m"]
     assert figures["after"]["accepted"]
 
-    # x points to the right, so that knee flexion is a negative angle of the shank
+    # The x axis points to the right, so knee flexion is a negative angle of the shank.
     knees = [p["coordinates"]["shank_angle"]["value_deg"] for p in run.chain]
     known = [angle for angle in knees if angle is not None]
     assert len(known) > 0.9 * len(knees)

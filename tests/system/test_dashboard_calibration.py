@@ -1,4 +1,4 @@
-"""The dashboard with the daemon and simulated hardware: a calibration with cameras, and its cost.
+"""The dashboard with the daemon and simulated hardware: calibration with cameras, and cost.
 
 The run writes screenshots of every view and the measured cost (``cost.json``) to
 ``build/dashboard``.
@@ -34,7 +34,7 @@ OPTIONS = (
     *("--follow", "--sensors-hz", "10", "--rate", "50", "--output-rate-hz", "50"),
     *("--align-s", "8", "--static-s", "3", "--functional-s", "25"),
 )
-"""Options of the simulator: short phases, and slow sensors for the sake of a loaded machine."""
+"""Options of the simulator: short phases, and slow sensors because the machine may be loaded."""
 MEASURED_S = 10.0
 """Duration of the measurement of cost, s."""
 ALL_ONLINE = """() => {
@@ -53,7 +53,7 @@ OPTICAL_PIXELS = """() => {
   }
   return count;
 }"""
-"""Number of pixels of the limb in the colour of the cameras."""
+"""JavaScript that returns the number of pixels in the colour of the cameras."""
 TURNED_BY = """([name, degrees]) => {
   const cards = [...document.querySelectorAll('#view-sensors .card')];
   const card = cards.find((card) => card.querySelector('h3')?.textContent === name);
@@ -61,13 +61,14 @@ TURNED_BY = """([name, degrees]) => {
   const angle = text === 'not turned' ? 0 : Number(/turned (\\d+)°/.exec(text)?.[1] ?? NaN);
   return Math.abs(angle - degrees) <= 5;
 }"""
-"""Whether the check of axes shows this rotation of a sensor, within the limit of "not turned"."""
+"""JavaScript that returns whether the check of axes shows this rotation, within the limit of "not
+turned"."""
 KNEES = "jointfit.store.poses.map((pose) => pose.joints.knee.flexion_deg).filter((x) => x !== null)"
 READY = {
     "live": "difference from the cameras", "calibrate": "Held-out error",
     "history": "Use version 2", "sensors": "Up in the drawing", "table": "Knee flexion",
 }  # fmt: skip
-"""A text of each view when it is complete."""
+"""A text that each view contains when it is complete."""
 FIRST_STEPS = ["Align", "Stand still"]
 FULL_CURVE = "() => jointfit.store.poses.length > 195"
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
@@ -98,7 +99,7 @@ def memory_mb(process: asyncio.subprocess.Process) -> float:
 
 
 async def calibrate(page: OpenedPage) -> None:
-    """Calibrate with cameras by the buttons of the page: refusal, stop and reload included."""
+    """Calibrate with cameras by the page's buttons, with a refusal, a stop and a reload."""
     await page.page.click("#main-action")
     await page.page.click(".rail >> text=Move")
     await page.page.click("text=Start moving")
@@ -136,7 +137,7 @@ async def calibrate(page: OpenedPage) -> None:
 
 
 async def revert(page: OpenedPage) -> None:
-    """Record another static pose, then use the first calibration again, in the history."""
+    """Record another static pose, then activate the first calibration in the history."""
     await page.page.click("#menu-button")
     await page.page.click("#menu >> text=Record the static pose again")
     await page.page.click("#action .primary")
@@ -148,7 +149,7 @@ async def revert(page: OpenedPage) -> None:
 
 
 async def see_the_limb_move(page: OpenedPage) -> None:
-    """Wait for a limb of IMUs and cameras that walks."""
+    """Wait until the limb from IMUs and cameras walks."""
     await page.show("live")
     await page.until_text("#angle-value", "°")
     await page.page.wait_for_selector("#legend-optical", state="visible")
@@ -176,11 +177,11 @@ async def record(page: OpenedPage) -> str:
 
 
 async def turn_a_sensor(page: OpenedPage, simulator: Simulator) -> None:
-    """Turn a simulated sensor while the subject stands: its axes follow."""
+    """Turn a simulated sensor while the subject stands; its axes must follow."""
     await page.show("sensors")
     await page.until_text("#view-sensors .turn", "turned")
     async with asyncio.timeout(60):
-        while True:  # the subject comes to rest
+        while True:  # until the subject rests
             await page.page.click("text=Set all to zero")
             await asyncio.sleep(1.0)
             turns = await page.page.locator(".turn").all_inner_texts()
@@ -194,7 +195,7 @@ async def turn_a_sensor(page: OpenedPage, simulator: Simulator) -> None:
 
 
 async def use_the_requests(page: OpenedPage) -> None:
-    """Use the requests of the Sensors view; the daemon answers."""
+    """Send the requests of the Sensors view; the daemon must answer."""
     await page.page.click("#view-sensors >> text=Self-test")
     await page.until_text("#action .answer", "checks passed")
     await page.picture("self-test")

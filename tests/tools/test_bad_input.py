@@ -1,6 +1,7 @@
-"""Every command on bad input of every kind: exit code 1 or 2, the object named, a remedy, no trace.
+"""Every command with every type of bad input: exit code 1 or 2, object, remedy, no traceback.
 
-The table is commands by damages; what a damage leaves usable may succeed.
+The table combines commands and types of damage. A command may succeed if the damaged file is still
+usable.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ SEGMENTS = ("--segment", "thigh=S1,S2", "--segment", "shank=S3,S4")
 MARKERS = ("--markers", "thigh=T1,T2,T3", "--markers", "shank=C1,C2,C3")
 IDS = ("--set", "ids={sample_time=0x205,group_counter=0x206,quaternion=0x221}")
 BAD = "BAD"
-"""Stands for the damaged file in a command."""
+"""Placeholder for the damaged file in a command."""
 
 COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "center trc": (
@@ -115,11 +116,11 @@ DAMAGES: dict[str, Callable[[bytes], bytes]] = {
 }
 
 OBJECTS = ("--parent", "marker", "trials", "refused")
-"""What else a message may name where the file itself can be read."""
+"""Objects that a message may name instead of the file if the file can be read."""
 LIBRARY_TEXT = ("could not convert", "codec can't", "allow_pickle", "reshape", "Errno", "[code:",
                 "unpack requires", "C3D magic", "no element found", "not well-formed", "CRC-32",
                 "zip file", "NoneType", "Traceback", "array of size")  # fmt: skip
-"""Words of libraries that say nothing to a user."""
+"""Library messages that do not help a user."""
 
 
 @pytest.fixture(scope="module")
@@ -135,16 +136,16 @@ def in_the_sample(sample: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def fault_of(words: Sequence[str], *named: str) -> str:
-    """Run a command; return "" or its message, which names the object and has a remedy."""
+    """Run a command; return its message, which names the object and a remedy, or ""."""
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # a library's warning is raw text, too
+        warnings.simplefilter("error")  # a warning of a library is also raw text
         result = run(app, list(words))
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     if result.exit_code == 0:
         return ""
     assert result.exit_code in (1, 2)
-    message = result.stderr or result.stdout  # a refused answer is part of the answer
+    message = result.stderr or result.stdout  # refused requests are part of the output
     assert any(name in message for name in named), message
     assert not [word for word in LIBRARY_TEXT if word in message], message
     assert "Warning" not in message
@@ -157,7 +158,7 @@ def test_damaged_files(tmp_path: Path, sample: Path, command: str, damage: str) 
     good, suffix, words = COMMANDS[command]
     bad = tmp_path / f"bad{suffix}"
     bad.write_bytes(DAMAGES[damage]((sample / good).read_bytes()))
-    if command == "calibrate":  # what may be a good rig must not look for a broker
+    if command == "calibrate":  # a valid rig must not connect to a broker
         words = ("check", *words[1:2])
     fault_of([word.replace(BAD, str(bad)) for word in words], "bad", *OBJECTS)
 
@@ -206,7 +207,8 @@ def test_output_files_are_checked_before_the_work(
     def work(*_: object, **__: object) -> None:
         raise AssertionError("the work began")
 
-    # Where they are used: a module imported meanwhile would keep the substitute for ever.
+    # Replace the functions in the modules that use them. A module imported meanwhile would keep the
+    # substitute.
     for reader in ("jointfit_daemon.tools.markers._trials.read_marker_trial",
                    "jointfit_daemon.tools.fuse._trial.read_recording",
                    "jointfit_daemon.files.mocap.read_marker_trial",

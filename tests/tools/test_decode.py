@@ -1,4 +1,4 @@
-"""`jointfit decode` on real captures: the counts that the recordings' own papers give, exactly."""
+"""`jointfit decode` on real captures: exactly the counts in the documents of the recordings."""
 
 from __future__ import annotations
 
@@ -52,13 +52,13 @@ def test_the_xsens_captures_hold_a_hundred_messages_each(
         "quaternions": quaternions,
         "first_quaternion": FIRST if quaternions else None,
         "last_quaternion": LAST if quaternions else None,
-        "time_resets": 0,  # although the time of all messages runs backwards four times
+        "time_resets": 0,  # although the time of all messages decreases four
         "counter_gaps": 0,
     }
 
 
 def frame_at(wire: bytes, number: int) -> int:
-    """Return where frame `number` (from 0) begins."""
+    """Return the position at which frame `number` (from 0) begins."""
     frames = [event for event in XbusCodec().feed(wire) if isinstance(event, XbusMessage)]
     return sum(len(encode(m.mid, m.data, m.bid)) for m in frames[:number])
 
@@ -68,7 +68,7 @@ def flipped(wire: bytes) -> bytes:
 
 
 def inserted(what: bytes) -> Callable[[bytes], bytes]:
-    """Return what puts bytes before frame 50 (the fifty-first)."""
+    """Return a function that inserts bytes before frame 50 (the fifty-first)."""
 
     def cut(wire: bytes) -> bytes:
         at = frame_at(wire, 50)
@@ -83,7 +83,7 @@ def long_tenth(wire: bytes) -> bytes:
 
 
 def begun_inside(number: int, from_end: int) -> Callable[[bytes], bytes]:
-    """Return what begins so many bytes before the end of a frame."""
+    """Return a function that starts a capture `from_end` bytes before the end of a frame."""
     return lambda wire: wire[frame_at(wire, number + 1) - from_end :]
 
 
@@ -180,7 +180,7 @@ def test_the_natnet_capture_holds_550_messages(shared_data: Path) -> None:
     assert found["messages"] == 550
     assert found["corrupt"] == found["discarded_bytes"] == 0
     assert found["time_resets"] == found["counter_gaps"] == 0
-    # five frames came before the model that names what is in them
+    # Five frames precede the model with the names of their content.
     assert found["mocap_frames"] == found["quaternions"] == 513
 
 
@@ -188,7 +188,7 @@ def test_the_natnet_capture_holds_550_messages(shared_data: Path) -> None:
 
 
 class CaptureTape:
-    """A CAN wire that keeps what is sent."""
+    """CAN wire that stores the sent frames."""
 
     is_open = True
 

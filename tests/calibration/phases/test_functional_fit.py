@@ -1,4 +1,4 @@
-"""The whole calibration against the geometry that made the data; what cannot be done is refused."""
+"""The whole calibration compared with the simulated geometry; impossible fits are refused."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def clean() -> tuple[Subject, Calibration]:
 
 
 def errors_deg(subject: Subject, calibration: Calibration, sensor: str) -> NDArray[np.float64]:
-    """Angles between a sensor's calibrated orientation and the true bone, on a new movement."""
+    """Return angles between a sensor's calibrated orientation and the bone, in a new movement."""
     moving = motion(subject, 20.0, 400.0)
     track = record(subject, moving, 9, cameras=False).sensors[sensor]
     item = calibration.sensor[sensor]
@@ -136,7 +136,7 @@ def test_centers_are_published_in_coordinates_of_both_segments(
         assert 0.0 < found["noise_error_m"] < 0.001 < found["predicted_error_m"]
         assert found["segments"].keys() == {above, below}
 
-        # the joint is the origin of its distal segment, and the markers have a mean
+        # The joint is the origin of its distal segment, and the markers have a mean.
         in_distal = found["segments"][below]
         expected = -np.mean(LOCAL[below], axis=0)
         assert np.linalg.norm(np.subtract(in_distal["center_m"], expected)) < 0.015
@@ -147,7 +147,7 @@ def test_centers_are_published_in_coordinates_of_both_segments(
                 (3 - len(side["unseen"])) * found["predicted_error_m"] ** 2
             )
 
-    # a hinge: the position along the axis is unobserved, and the axis points to the right
+    # At a hinge, the position along the axis is unobservable, and the axis points to the right.
     knee = centers["knee"]["segments"]["thigh"]
     assert knee["unseen"] == [knee["axis"]]
     assert abs(knee["axis"][0]) > 0.99
@@ -185,7 +185,7 @@ def test_correction_has_smaller_errors_than_the_mean_and_is_fitted_in_three_seco
     alignment = fit_plate_alignment(plate_trial(subject), SETTINGS)
     began = time.process_time()
     found = fit_calibration(static, functional, alignment, SETTINGS, CHAIN)
-    assert time.process_time() - began < 15.0  # generous: three seconds on a quiet machine
+    assert time.process_time() - began < 15.0  # loose limit; three seconds on an idle machine
     figures = found.quality["holdout"]
     for segment in CHAIN.segments:
         of = figures["segments"][segment]

@@ -1,4 +1,4 @@
-"""The store: whole versions or none, nothing overwritten, damage named and stepped over."""
+"""The store: complete versions only, no overwriting, and reports of damaged versions."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def test_a_name_that_leaves_the_directory_is_refused(tmp_path: Path, name: str) 
 
 
 def stored_table(folder: Path) -> dict[str, Any]:
-    """Return the file of a taught limb as the store writes it, parsed."""
+    """Return the parsed file of a limb with online learning, as the store writes it."""
     link = SensorLink(
         "S1",
         "S2",

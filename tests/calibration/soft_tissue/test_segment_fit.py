@@ -1,4 +1,4 @@
-"""Segment models on a made limb with soft tissue: what each promises, one frame against many."""
+"""Segment models on a simulated limb with soft tissue: accuracy, and single frames."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ N = 600
 
 
 class Limb:
-    """A knee that bends and twists; skin follows its flexion, each sensor in its own way."""
+    """Knee with flexion and rotation; the soft-tissue artefact of each sensor follows flexion."""
 
     def __init__(self, seed: int = 0, sensors: int = 2, range_rad: float = 1.2) -> None:
         rng = np.random.default_rng(seed)
@@ -106,7 +106,7 @@ def test_the_single_is_the_sensor_that_was_nearest_in_training_bit_for_bit() -> 
 
 
 def test_markley_removes_constant_rotations_and_weights_the_residuals() -> None:
-    """An oracle by construction: constants in, constants out, whatever the signs."""
+    """The expected values follow from the construction: constant rotations with any signs."""
     rng = np.random.default_rng(3)
     limb = Limb()
     free = [rot.multiply(limb.segment, rot.exp(s * rng.normal(size=(N, 3)))) for s in (0.01, 0.03)]
@@ -125,7 +125,7 @@ def test_markley_removes_constant_rotations_and_weights_the_residuals() -> None:
 def test_corrections_beat_the_mean_on_movement_they_did_not_see() -> None:
     limb = Limb()
     mean = limb.error(limb.fit("mean"))
-    assert limb.error(limb.fit("anchored")) < 0.35 * mean  # what is left is the sensors' own noise
+    assert limb.error(limb.fit("anchored")) < 0.35 * mean  # the rest is the noise of the sensors
     assert limb.error(limb.fit("patent12")) < 0.8 * mean
 
 
@@ -144,7 +144,7 @@ def test_rotated_world_only_rotates_the_result(method: Method, turn: float) -> N
 
 def test_anchored_correction_is_zero_in_the_static_pose() -> None:
     model = Limb().fit("anchored")
-    pose = (0.6, 0.0, 0.0, 0.8)  # upright, whatever the heading
+    pose = (0.6, 0.0, 0.0, 0.8)  # upright with any heading
     assert rot.angle_between(model.predict_one([pose, pose], pose).q, pose) < 1e-12
 
 
@@ -215,7 +215,7 @@ def test_patent6_shares_the_coefficients_and_patent12_does_not() -> None:
 
 
 def test_the_patent_finds_coefficients_that_were_put_in() -> None:
-    # the reference is made of the sensors by a known rule, so least squares must return that rule
+    # The reference is a known function of the sensors, so least squares must return this function.
     limb = Limb()
     x, y = (rot.align_hemisphere(q, limb.segment[0]) for q in limb.sensors)
     target = rot.normalize(0.7 * x + 0.3 * y)

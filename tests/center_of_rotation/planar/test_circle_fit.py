@@ -254,7 +254,7 @@ def test_arc_of_spread_recovers_the_arc(arc: float) -> None:
 
 
 def test_arcs_are_counted_between_the_outermost_points() -> None:
-    t = np.linspace(3.0, 4.0, 40)  # through the cut of atan2
+    t = np.linspace(3.0, 4.0, 40)  # across the discontinuity of atan2
     p = np.stack((np.cos(t), np.sin(t)), axis=-1)
     assert arc_about(p, np.zeros(2)) == pytest.approx(1.0)
     t = np.linspace(0, 2 * pi, 40)
@@ -266,11 +266,11 @@ def test_arcs_are_counted_between_the_outermost_points() -> None:
 
 
 def covered(truth: float) -> tuple[float, float]:
-    """Integrate coverage given publication for T ~ N(truth, 1) and unlimited frames."""
+    """Integrate the coverage of published centers for T ~ N(truth, 1) and unlimited frames."""
     z, dz = np.linspace(-9, 9, 20_001, retstep=True)
     t = truth + z
     z, t = z[t >= GATE], t[t >= GATE]
-    drawn = truth * t / (t**2 + 1.0)  # center over true radius, after drawing in
+    drawn = truth * t / (t**2 + 1.0)  # center divided by true radius, after shrinkage
     pull2 = ((drawn - 1.0) * t / drawn) ** 2
     allowed = np.array([ellipse_scale(1e9, float(v)) for v in t])
     room = np.sqrt(np.maximum(allowed - pull2, 0.0)) * drawn

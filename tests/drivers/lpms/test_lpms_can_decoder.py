@@ -59,7 +59,7 @@ def settings(
 
 
 def recorded(count: int, **options: Any) -> list[CanFrame]:
-    """Return the frames of `count` samples, one each 10 ms, frames 0.2 ms apart."""
+    """Return the frames of `count` samples every 10 ms, with 0.2 ms between frames."""
     wire = RecordingWire()
     device = LpmsCanDevice(wire, LpmsCanDeviceOptions(**options))  # type: ignore[arg-type]
     stamped: list[CanFrame] = []
@@ -86,7 +86,7 @@ def texts(events: list[Decoded], kind: str) -> list[str]:
 
 
 def test_lpbus_in_can_frames_is_the_stream_of_the_serial_line() -> None:
-    """The third mode of generation 1, which the simulator has and no driver reads."""
+    """LP-BUS in CAN frames is the third mode of generation 1, which no driver reads."""
     frames = recorded(3, mode="lpbus", node=1)
     assert {frame.can_id for frame in frames} == {0x515}
     assert max(len(frame.data) for frame in frames) == 8

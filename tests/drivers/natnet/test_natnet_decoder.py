@@ -1,4 +1,4 @@
-"""The pure half of the NatNet driver: names, poses, time, and everything that may go wrong."""
+"""The decoder of the NatNet driver: names, poses, time, and faults."""
 
 from __future__ import annotations
 

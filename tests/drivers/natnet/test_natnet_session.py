@@ -1,4 +1,4 @@
-"""The reading half of the NatNet driver against servers in every mood, and against a recording."""
+"""The session of the NatNet driver with servers in every state, and with a recording."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ SCENE: tuple[dict[str, Any], dict[str, Any]] = ({"T1": (1.0, 2.0, 3.0)}, {"Thigh
 async def at_work(
     server: Any, **settings: Any
 ) -> AsyncIterator[tuple[DecodingReceiver, asyncio.Task[None]]]:
-    """Serve and drive; yields what is heard and the driver's task."""
+    """Run server and driver; yield the receiver and the driver's task."""
     table = {"driver": "natnet", "server": "127.0.0.1", "command_port": server.command_port}
     driver = NatNetMocap(NatNetSettings.model_validate(table | settings))
     heard = DecodingReceiver(driver, MocapFrame)
@@ -54,7 +54,7 @@ async def at_work(
 async def until(
     condition: Callable[[], object], server: NatNetServer | None, within_s: float = 5
 ) -> None:
-    """Push frames until `condition`."""
+    """Send frames until `condition` is true."""
     async with asyncio.timeout(within_s):
         while not condition():
             if server is not None:
@@ -208,7 +208,7 @@ async def test_a_network_card_that_does_not_exist_is_a_wrong_setting() -> None:
 
 
 class Claimant(NatNetServer):
-    """Says of itself what it is told."""
+    """Server that describes itself with given values."""
 
     claims: ServerInfo
 
@@ -266,7 +266,7 @@ async def test_silence_names_the_transport_where_it_contradicts_the_server(
 async def test_a_server_that_answers_but_sends_no_frames_is_lost_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Its answers open the source again only together with the first frame."""
+    """The source is reopened only when the first frame has arrived."""
     monkeypatch.setattr(_session, "FIRST_ECHOES", 1)
     server = serve()
     table = {"driver": "natnet", "server": "127.0.0.1", "silence_s": 0.2}

@@ -1,4 +1,4 @@
-"""Shared CAN buses: who gets what, what happens when one fails, what a user is told."""
+"""Shared CAN buses: distribution of frames, failures of a user, and error messages."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ async def test_two_sensors_on_one_adapter_each_get_their_own(tmp_path: Path) -> 
 
 
 class Eager(SlcanAdapter):
-    """Sends the first group of a sensor in the same write as its answer to `O`."""
+    """Adapter that sends a sensor's first group in the same write as its answer to `O`."""
 
     sensor: XcdiDevice
     group: list[CanFrame] | None = None
@@ -195,7 +195,7 @@ async def test_a_sensor_that_worked_and_falls_silent_has_one_text_at_all_attempt
 async def test_a_sensor_that_came_late_is_reported_as_soon_as_one_that_was_there(
     tmp_path: Path,
 ) -> None:
-    """The longer waits of the attempts on a silent bus end with its first frame."""
+    """The longer waits between attempts on a silent bus end with the first frame."""
     adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
     device = XcdiDevice(adapter, XcdiDeviceOptions(ids=id_block(0x100)))
     driver = xcdi_driver("S3", bus, 0x100, silence_s=0.2)
@@ -369,7 +369,7 @@ async def test_an_adapter_left_streaming_by_a_crash_is_taken_over(tmp_path: Path
         run = DriverRun(xcdi_driver("S3", bus))
         await opened(adapter)
         await run.cancel()
-        adapter.is_open = True  # the host died without a word
+        adapter.is_open = True  # the host ended without closing the bus
         for number in range(50):
             device.push(number * 10_000_000, IDENTITY)
         run = DriverRun(xcdi_driver("S3", bus))
@@ -382,7 +382,7 @@ async def test_an_adapter_left_streaming_by_a_crash_is_taken_over(tmp_path: Path
 
 
 class Chatter:
-    """A GPS receiver: talks all the time, listens never."""
+    """GPS receiver that sends continuously and ignores its input."""
 
     def __init__(self, link: Path) -> None:
         self._line = PtyLine(link)

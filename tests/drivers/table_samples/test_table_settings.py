@@ -1,4 +1,4 @@
-"""Tables in rig.toml: faults with key and remedy; shipped tables decode their vectors."""
+"""Tables in rig.toml: faults with key and remedy; the shipped tables decode test vectors."""
 
 from __future__ import annotations
 
@@ -270,7 +270,7 @@ def test_the_table_of_inertial_sense_decodes_a_message_as_its_documents_describe
     content = struct.pack("<IdII4f3f3d", 2300, 123456.789, 0x11, 0, *q, *[0.0] * 6)
     message = b"\xef\x49\x04\x05" + struct.pack("<H", len(content)) + content
     a = b = 0
-    for byte in message:  # as the vendor's example program computes it
+    for byte in message:  # as in the vendor's example program
         a = (a + byte) & 0xFF
         b = (b + a) & 0xFF
     other = b"\xef\x49\x04\x01\x00\x00\x3d\x9d"

@@ -1,4 +1,4 @@
-"""The pure half of the Xbus driver: samples, stamps, gaps, restarts, gates."""
+"""The decoder of the Xbus driver: samples, stamps, gaps, restarts and gates."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_arrivals_never_run_backwards_on_a_line_faster_than_its_speed() -> None:
 
 def test_incomplete_message_is_dropped_after_a_silence() -> None:
     events = decoder()
-    events.feed(Chunk(0, bytes.fromhex("faff36ff07d0")))  # waits for 2000 bytes
+    events.feed(Chunk(0, bytes.fromhex("faff36ff07d0")))  # the codec then waits for 2000 bytes
     found = events.feed(Chunk(300_000_000, message(1, 100)))
     assert [type(event) for event in found] == [Corrupt, ImuSample]
 
@@ -202,7 +202,7 @@ def test_whatever_is_lost_is_counted_exactly(counter: int, ticks: int, losses: l
 
 
 @given(st.integers(0, 10_000), st.integers(13_000, 2**31))
-@example(0, 830_562_750)  # 56 minutes before midnight of the device: no time for that has passed
+@example(0, 830_562_750)  # 56 minutes before the device's midnight, for which no time has passed
 def test_clock_reset_is_a_restart_after_a_second_message(after: int, before: int) -> None:
     follow = XbusContinuity(100.0)
     ticks = (before - 100, before, after, after + 100)

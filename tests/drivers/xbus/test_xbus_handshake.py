@@ -1,4 +1,4 @@
-"""The Xbus handshake against simulated devices in every mood."""
+"""The Xbus handshake with simulated devices in every state."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def make(folder: Path, **more: Any) -> XbusImu:
 
 
 async def chunks_of(driver: XbusImu, samples: int = 5) -> list[Chunk]:
-    """Run until `samples` were emitted; raises what run raises."""
+    """Run the driver until it has emitted `samples`; its errors are raised."""
     chunks: list[Chunk] = []
     task = asyncio.create_task(driver.run(chunks.append))
     try:
@@ -79,7 +79,7 @@ async def test_emitted_bytes_begin_with_the_acknowledgement_and_contain_all_repl
     found = mids(chunks)
     assert found[0] == XbusMessageId.GOTO_CONFIG_ACK
     setup_ids = found[: found.index(XbusMessageId.GOTO_MEASUREMENT_ACK)]
-    assert XbusMessageId.MT_DATA2 not in setup_ids  # nothing of before
+    assert XbusMessageId.MT_DATA2 not in setup_ids  # no earlier message
     assert {
         XbusMessageId.DEVICE_ID, XbusMessageId.PRODUCT_CODE, XbusMessageId.FIRMWARE,
         XbusMessageId.FILTER_PROFILE_ACK, XbusMessageId.OUTPUT_CONFIGURATION_ACK,
@@ -183,7 +183,7 @@ async def test_a_wrong_speed_is_named_with_the_right_one(tmp_path: Path) -> None
     device = XbusDevice(tmp_path / "imu", options=options)
     async with serving(device, feeding=True):
         said = await refusal(make(tmp_path), DeviceMisconfiguredError)
-        assert device.streaming  # left as it was
+        assert device.streaming  # unchanged
     assert "set baud = 921600" in said
     assert "S1" not in said, "the log line begins with the id"
 
@@ -198,7 +198,7 @@ async def test_a_silent_device_at_another_speed_is_found_at_the_first_attempt(
 
 
 class Queueing(XbusDevice):
-    """Works off its requests one after the other, each GoToConfig in 1.5 s."""
+    """Device that executes its requests one after another, each GoToConfig in 1.5 s."""
 
     asked = 0
     free_s = 0.0
@@ -222,7 +222,7 @@ async def test_a_device_that_acknowledges_after_a_second_and_a_half_comes_up(
             assert len(await chunks_of(make(folder))) >= 5
             assert device.asked == 1 or not streams, "one request at a time"
 
-    # Both wait for seconds, so they run at the same time.
+    # Both wait for seconds, so they run together.
     await asyncio.gather(
         comes_up(tmp_path_factory.mktemp("streaming"), streams=True),
         comes_up(tmp_path_factory.mktemp("silent"), streams=False),
@@ -236,14 +236,14 @@ async def test_device_that_restarts_at_every_request_is_configured(tmp_path: Pat
 
 
 async def test_a_late_answer_of_a_port_without_a_speed_is_no_other_speed(tmp_path: Path) -> None:
-    class Late(XbusDevice):  # over USB, where any speed will do
+    class Late(XbusDevice):  # over USB, which accepts any speed
         awake_s: float | None = None
 
         @override
         def _answer(self, message: XbusMessage) -> None:
             loop = asyncio.get_running_loop()
             if self.awake_s is None:
-                self.awake_s = loop.time() + 3.6  # between the last try and the next speed's end
+                self.awake_s = loop.time() + 3.6  # between last attempt and next speed
             loop.call_at(self.awake_s, super()._answer, message)
 
     device = Late(tmp_path / "imu")
@@ -259,7 +259,7 @@ async def test_noise_before_silence_is_reported_without_figures(tmp_path: Path) 
     line.write(b"\x01\x02\x03")
     with pytest.raises(DeviceLostError) as caught:
         await running
-    # A figure would differ at every attempt, and every different text is a new line of the log.
+    # A number would differ at every attempt, and every new text would add a line to the log.
     assert str(caught.value) == (
         f"{tmp_path}/imu: some bytes of noise, then silence: check its power and cable, and `port`"
     )
@@ -275,7 +275,7 @@ async def test_a_silent_port_may_come_to_life(tmp_path: Path) -> None:
     loop = asyncio.get_running_loop()
     began = loop.time()
     assert "silent" in await refusal(driver, DeviceLostError)
-    assert loop.time() - began < 2.0  # the second time it is not looked for at every speed
+    assert loop.time() - began < 2.0  # the second attempt does not try every speed
     line.unplug()
 
 

@@ -1,4 +1,4 @@
-"""Raw readings of an Xbus device become the orientation that the filter's package gives."""
+"""Raw readings of an Xbus device yield the orientation that the filter package computes."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def orientations(events: list[Decoded]) -> Array:
 
 
 def turning(n: int, rate: float = 1.0) -> list[tuple[tuple[int, Any], ...]]:
-    """Return raw items of a sensor that turns about the vertical, rad/s."""
+    """Return the raw items of a sensor that turns about the vertical at `rate`, rad/s."""
     return [((Item.RATE_OF_TURN, (0.0, 0.0, rate)), (Item.ACCELERATION, UP))] * n
 
 
@@ -91,7 +91,7 @@ def test_a_real_trial_through_the_driver_equals_the_package_run_directly(
     assert rotation.angle_between(said, direct).max() < 1e-12
     seen = np.isfinite(optical[:, 0]) & (np.arange(len(optical)) > 9 * 286)
     error = rotation.angle_between(said[seen], optical[seen])
-    assert np.rad2deg(np.sqrt(np.mean(error**2))) < goal_deg + 0.6  # only a minute to find north
+    assert np.rad2deg(np.sqrt(np.mean(error**2))) < goal_deg + 0.6  # only a minute to converge
 
 
 def test_the_interval_is_that_of_the_device_clock_and_not_the_nominal_one() -> None:
@@ -106,7 +106,7 @@ def test_the_interval_is_that_of_the_device_clock_and_not_the_nominal_one() -> N
 
 
 def testicks_too_coarse_for_one_interval_do_not_change_the_turn() -> None:
-    """60 Hz is 166.67 ticks; the first interval alone would be wrong by 0.4 %."""
+    """At 60 Hz, an interval has 166.67 ticks; the first interval alone has an error of 0.4 %."""
     orientation = GatewayOrientation(60.0, magnetometer=False, settle_s=0.0)
     turned, before = 0.0, None
     for k in range(1201):
@@ -141,7 +141,7 @@ def test_filter_restarts_with_the_same_heading_after_a_long_gap() -> None:
     assert [(e.kind, e.data) for e in told] == [("warning", {"missing": 10})]
     found = samples(events)
     before, after = found[149].q_world_sensor, found[150].q_world_sensor
-    assert angle(before, after) < 0.02  # what it turned unseen is unknown, and not made up
+    assert angle(before, after) < 0.02  # the rotation during the gap is unknown and not estimated
 
 
 def test_a_tilt_after_a_long_gap_comes_from_the_accelerometer() -> None:
@@ -184,7 +184,7 @@ def test_no_sample_is_emitted_before_the_filter_has_settled(
     wires = [message(k, 100 * k, *items) for k, items in enumerate(contents)]
     settled, at_once = samples(decoded(wires, settle_s=3.0)), samples(decoded(wires))
     assert settled[0].ticks == round(first_s * 100) * TICKS
-    assert settled == at_once[-len(settled) :]  # what comes is what would have come anyway
+    assert settled == at_once[-len(settled) :]  # the output equals the output without settling
 
 
 def test_a_filter_at_rest_settles_sooner() -> None:
@@ -199,7 +199,7 @@ def test_a_filter_at_rest_settles_sooner() -> None:
 def test_heading_after_a_start_in_fast_motion_is_settled_with_the_inclination(
     shared_data: Path,
 ) -> None:
-    """Recorded board, 579 °/s RMS: 24 starts, RMS error of the first second with output."""
+    """Recorded board at 579 °/s RMS: RMS error of the first second with output, in 24 starts."""
     with np.load(shared_data / "broad_excerpts" / "07_undisturbed_fast_rotation_B_60s.npz") as file:
         felt = [file[f"imu_{kind}"].astype(float).tolist() for kind in ("gyr", "acc", "mag")]
         optical = file["opt_quat"].astype(float)
@@ -265,7 +265,7 @@ def test_after_a_long_gap_in_fast_motion_the_sensor_is_silent_till_it_has_settle
 
 
 def test_a_fast_rate_that_repeats_itself_is_at_the_end_of_its_range() -> None:
-    """Without a status word, too; a slow rate may repeat, a fast one never does."""
+    """This also applies without a status word; a slow rate may repeat, a fast rate never does."""
     fast = [(7.85398, 0.0, 0.0)] * 3 + [(7.0 + 0.01 * k, 0.1, 0.2) for k in range(30)]
     slow = [(1.0, 0.0, 0.0)] * 30
     for rates, expected in ((fast, 1), (slow, 0), (fast[3:], 0)):
@@ -289,7 +289,7 @@ def test_every_precision_of_raw_items_is_understood(precision: Precision) -> Non
 
 
 def test_sample_of_the_raw_filter_has_acceleration_and_field_but_no_mean_rate() -> None:
-    """Interpolated with rates half a period old, fast motion is met four times worse."""
+    """With rates that are half a period old, the error of fast motion is four times larger."""
     bias = (0.01, -0.02, 0.005)
     items = ((Item.RATE_OF_TURN, bias), (Item.ACCELERATION, UP), (Item.MAGNETIC_FIELD, (1.0, 0, 0)))
     found = samples(decoded([message(k, 100 * k, *items) for k in range(1500)], magnetometer=True))

@@ -1,4 +1,4 @@
-"""The pure half of the XCDI driver: samples, gaps, restarts, units, and two sensors on one id."""
+"""The decoder of the XCDI driver: samples, gaps, restarts, units, and shared identifiers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MS = 1_000_000
 
 
 class FrameTape:
-    """A wire that keeps what is sent, stamped with a time of the test's own."""
+    """Wire that stores the sent frames with a time stamp of the test."""
 
     bitrate: int | None = None
 
@@ -136,7 +136,7 @@ def test_a_pause_with_a_running_clock_and_a_counter_that_stands_is_no_restart(un
     device = XcdiDevice(tape)
     tape.play(device, range(300))
     counter = device.counter
-    tape.play(device, range(700, 800))  # 4 s of silence; the counter counts sent groups only
+    tape.play(device, range(700, 800))  # 4 s without groups; the counter counts sent groups only
     assert device.counter == counter + 100
     found = decoded(tape, decoder)
     assert not of_kind(found, "restart")
@@ -274,7 +274,7 @@ def test_two_sensors_that_speak_in_turn_frame_by_frame_are_found_out() -> None:
 
 
 def interleaved(groups: list[list[CanFrame]], order: random.Random) -> list[CanFrame]:
-    """Return the frames of several groups in random order; each group retains its own order."""
+    """Return frames of several groups in random order; the order within a group remains."""
     left = [list(group) for group in groups if group]
     mixed: list[CanFrame] = []
     while left:
@@ -385,7 +385,7 @@ def test_identifiers_left_out_move_with_their_block() -> None:
 
 @pytest.mark.parametrize("base", [-1, 0, 1, 0x7DE, 0x7DF, 0x7FE])
 def test_derived_identifiers_never_leave_the_range_of_the_given_ones(base: int) -> None:
-    """The block's largest identifier is the quaternion's, which is always given and checked."""
+    """The quaternion has the largest identifier of the block, which is given and checked."""
     ids = {"sample_time": base + 5, "group_counter": base + 6, "quaternion": base + 0x21}
     if base + 0x21 > 0x7FF:
         with pytest.raises(ValidationError, match="above 0x7FF, the greatest 11-bit identifier"):

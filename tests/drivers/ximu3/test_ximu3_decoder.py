@@ -1,4 +1,4 @@
-"""The pure half of the x-IMU3 driver: samples, worlds, gaps, restarts, corruption, reports."""
+"""The decoder of the x-IMU3 driver: samples, worlds, gaps, restarts, corruption, reports."""
 
 from __future__ import annotations
 
@@ -240,7 +240,7 @@ def test_a_time_with_a_flipped_bit_is_dropped() -> None:
 
 
 def test_a_sudden_motion_is_delayed_by_one_message_and_complete() -> None:
-    """At rest, then 30 rad/s from one sample to the next."""
+    """The angular rate changes from 0 to 30 rad/s between two samples."""
     angles = [0.0] * 50 + [0.15 * number for number in range(1, 20)]
     wires = [message(n, (math.cos(a), math.sin(a), 0.0, 0.0)) for n, a in enumerate(angles)]
     events = fed(decoder(), *wires)

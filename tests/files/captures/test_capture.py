@@ -1,4 +1,4 @@
-"""Captures of every kind become chunks."""
+"""Captures of every type are converted to chunks."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_a_pcapng_file_keeps_the_time_of_its_interface(
 
 @pytest.mark.parametrize("vlan", [False, True])
 def test_udp_payloads_over_ipv6_are_read_behind_extension_headers(vlan: bool) -> None:
-    options = b"\x3c\0" + bytes(6) + b"\x11\x01" + bytes(14)  # hop by hop, then destination
+    options = b"\x3c\0" + bytes(6) + b"\x11\x01" + bytes(14)  # hop-by-hop, then destination
     packets = [ipv6(udp(b"plain")), ipv6(options + udp(b"behind"), 0), ipv6(udp(b"x"), 58)]
     frames = [(0, ethernet(packet, vlan)) for packet in packets]
     assert [packet.payload for packet in read_udp(pcap(frames))] == [b"plain", b"behind"]

@@ -1,4 +1,4 @@
-"""OpenSim models as chains of ours."""
+"""Conversion of OpenSim models to chain models of the project."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ NAMES = ["hf", "ha", "hr", "knee"]
 
 @pytest.fixture(scope="module")
 def opensim() -> Any:
-    """Return OpenSim's own library, silent and without a log file."""
+    """Return OpenSim's library, without output and log file."""
     library = pytest.importorskip("opensim", reason="opensim is not installed")
     library.Logger.removeFileSink()
     library.Logger.setLevelString("Off")
@@ -66,7 +66,7 @@ def opensim() -> Any:
 
 
 def moved(opensim: Any, path: Path, values: np.ndarray) -> tuple[list[str], np.ndarray]:
-    """Return the markers of a model as OpenSim places them, y up: values of all coordinates."""
+    """Return a model's marker positions from OpenSim, y up, for values of all coordinates."""
     model = opensim.Model(str(path))
     state = model.initSystem()
     markers = [model.getMarkerSet().get(i) for i in range(model.getMarkerSet().getSize())]
@@ -111,7 +111,7 @@ def test_our_least_squares_are_those_of_opensim(tmp_path: Path, opensim: Any) ->
 def _their_residuals(
     opensim: Any, path: Path, names: list[str], placed: np.ndarray, folder: Path
 ) -> np.ndarray:
-    """Return distances, m, shape (T, M), that OpenSim's inverse kinematics leaves."""
+    """Return the marker distances after OpenSim's inverse kinematics, m, shape (T, M)."""
     rows = [
         "PathFileType\t4\t(X/Y/Z)\tmarkers.trc",
         "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
@@ -162,7 +162,7 @@ WAYS = {
 
 
 def walker_knee(way: str) -> Hung:
-    """Return a knee that turns about all axes and shifts along two as one coordinate says."""
+    """Return a knee that rotates about three axes and moves along two, by one coordinate."""
     screw = spline(BENDS.tolist(), (0.1 * np.cos(BENDS)).tolist())
     axes = [("knee", Z, LINEAR), ("knee", X, screw), ("knee", Y, screw)]
     axes += [("knee", X, WAYS[way]), ("knee", Y, screw), ("", Z, ZERO)]
@@ -420,7 +420,7 @@ def test_the_published_model_moves_its_markers_as_opensim_does(
     shared_data: Path, opensim: Any
 ) -> None:
     path = shared_data / "opencap_subject4" / "models" / "manually_scaled.osim"
-    loaded = opensim.Model(str(path))  # kept: its coordinates live no longer than it does
+    loaded = opensim.Model(str(path))  # the coordinates need the model object
     coordinates = loaded.getCoordinateSet()
     chosen = [coordinates.get(i) for i in range(coordinates.getSize())]
     knees = np.array(["knee" in c.getName() for c in chosen])

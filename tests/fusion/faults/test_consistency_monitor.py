@@ -43,7 +43,7 @@ def calibration() -> Calibration:
 
 @pytest.fixture(scope="module")
 def walk() -> tuple[Array, dict[str, Array], dict[str, Array]]:
-    """Two minutes at 25 frames a second: instants (s), sensor orientations, bone orientations."""
+    """Return times (s), sensor orientations and bone orientations of two minutes at 25 Hz."""
     moving = motion(SUBJECT, 120.0, 200.0)
     tracks = record(SUBJECT, moving, 31, cameras=False).sensors
     t_s = tracks["S1"].t_ns[::4] * 1e-9
@@ -57,7 +57,7 @@ def walk() -> tuple[Array, dict[str, Array], dict[str, Array]]:
 def play(
     fuser: LimbFuser, t_s: Array, measured: Mapping[str, Array]
 ) -> tuple[list[LimbState], list[tuple[float, str, str]]]:
-    """Return states, and time (s), id and state of the reports."""
+    """Fuse a movement; return the states, and time (s), id and state of each report."""
     rows = {name: [tuple(q) for q in array.tolist()] for name, array in measured.items()}
     states, reported = [], []
     for k, t in enumerate(t_s):
@@ -71,20 +71,20 @@ def play(
 def healthy(
     calibration: Calibration, walk: tuple[Array, dict[str, Array], dict[str, Array]]
 ) -> tuple[list[LimbState], list[tuple[float, str, str]]]:
-    """Return states and reports of the walk; those of its beginning are those of a shorter one."""
+    """Return states and reports of the walk, which also contain those of a shorter walk."""
     t_s, measured, _ = walk
     return play(LimbFuser(CHAIN, calibration), t_s, measured)
 
 
 def slipped(t_s: Array, q: Array, degrees: float, at_s: float) -> Array:
-    """Return a sensor that slides on its segment within 0.3 s."""
+    """Return the orientations of a sensor that slips on its segment within 0.3 s."""
     share = np.clip((t_s - at_s) / 0.3, 0.0, 1.0)
     slide = Rotation.from_rotvec(np.radians(degrees) * np.outer(share, [0.6, -0.5, 0.62]))
     return np.asarray((Rotation.from_quat(q, scalar_first=True) * slide).as_quat(scalar_first=True))
 
 
 def drifting(t_s: Array, q: Array, degrees_a_minute: float) -> Array:
-    """Return a sensor whose world turns about the vertical."""
+    """Return the orientations of a sensor whose world rotates about the vertical."""
     turn = rotation.heading(np.radians(degrees_a_minute) * t_s / 60)
     return rotation.multiply(turn, q)
 
@@ -94,7 +94,7 @@ def oriented(states: list[LimbState], segment: int) -> Array:
 
 
 def joint_error(states: list[LimbState], bones: Mapping[str, Array]) -> Array:
-    """Return the angle between the joint's rotation and the true one, deg."""
+    """Return the angle between the estimated and the true joint rotation, deg."""
     measured = rotation.multiply(rotation.conjugate(oriented(states, 0)), oriented(states, 1))
     true = rotation.multiply(rotation.conjugate(bones["thigh"]), bones["shank"])
     return np.asarray(np.degrees(rotation.angle_between(measured, true)))
@@ -151,7 +151,7 @@ def test_end_of_a_slip_is_reported(
 
 
 def disturbed(t_s: Array, q: Array, degrees: float) -> Array:
-    """Return a sensor with a magnetic disturbance from 8 to 20 s, rising and falling in 3 s."""
+    """Return a sensor with a magnetic disturbance from 8 to 20 s, with ramps of 3 s."""
     away = np.clip((t_s - 8.0) / 3.0, 0.0, 1.0) - np.clip((t_s - 20.0) / 3.0, 0.0, 1.0)
     return rotation.multiply(rotation.heading(np.radians(degrees) * away), q)
 
@@ -232,7 +232,7 @@ def test_the_number_of_compared_pairs_grows_with_that_of_the_sensors() -> None:
     groups = [[f"S{i}" for i in range(count)] for count in (2, 5, 6, 16, 32)]
     assert [len(compared_pairs(group)) for group in groups] == [1, 10, 10, 30, 62]
     for group in groups[2:]:
-        for lost in (None, *group):  # each sensor keeps two partners, whichever other one is lost
+        for lost in (None, *group):  # each sensor has two others, even if one is lost
             partners = Counter(
                 n for pair in compared_pairs(group) if lost not in pair for n in pair
             )
@@ -304,7 +304,7 @@ def test_reload_preserves_drift_corrections(
     fuser, same = LimbFuser(CHAIN, calibration), LimbFuser(CHAIN, calibration)
     for each in (fuser, same):
         play(each, t_s[half], {name: q[half] for name, q in faulty.items()})
-    stored = Calibration.from_dict(calibration.to_dict())  # as read from the store again
+    stored = Calibration.from_dict(calibration.to_dict())  # as if read from the store
     reloaded, fresh = LimbFuser(CHAIN, stored), LimbFuser(CHAIN, stored)
     reloaded.resume(fuser)
     left = {name: q[rest] for name, q in faulty.items()}
@@ -360,7 +360,7 @@ def test_unobserved_drift_increases_the_standard_deviation(
         grown = [s.segments[k].sd or 0.0 for s in (states[25], states[-1])]
         assert grown[1] > grown[0] + np.radians(2.0)
         assert (north[-1].segments[k].sd or 0.0) < grown[1]
-    assert states[-1].joints[1].angle_sd == north[-1].joints[1].angle_sd  # observed at the hinge
+    assert states[-1].joints[1].angle_sd == north[-1].joints[1].angle_sd  # observable at the hinge
     assert (states[-1].joints[2].position_sd or 0.0) >= (north[-1].joints[2].position_sd or 0.0)
     assert "heading_unseen" in states[-1].flags
     loose = tuple(link for link in calibration.links if link.kind == "pair")

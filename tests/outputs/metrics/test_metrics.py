@@ -1,4 +1,4 @@
-"""Metrics as the parser of Prometheus reads them: names, units, values; and their cost."""
+"""Metrics as Prometheus parses them: names, units and values; and their cost."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ async def test_the_histogram_counts_each_frame_once_in_its_bucket(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     frames, now_ns = FrameStatistics(), 10**9 * 3600
-    clock = SimpleNamespace(monotonic_ns=lambda: now_ns)  # a stall would change the bucket
+    clock = SimpleNamespace(monotonic_ns=lambda: now_ns)  # a pause would change the bucket
     monkeypatch.setattr("jointfit_daemon.outputs.metrics._frame_statistics.time", clock)
     for latency_ms in (0, 7, 7, 2000):
         frames.output(FRAME._replace(completed_ns=now_ns - latency_ms * 1_000_000))

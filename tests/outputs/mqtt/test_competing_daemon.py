@@ -31,7 +31,7 @@ POSE_S = 0.05
 
 @contextlib.asynccontextmanager
 async def daemon_link(port: int, version: str) -> AsyncIterator[MqttPublisher]:
-    """Yield the link of one daemon that publishes poses all the time."""
+    """Yield the link of one daemon that publishes poses continuously."""
     asyncio.get_running_loop().set_exception_handler(DisconnectErrorFilter())
     outbox = Outbox(f"{BASE}/bridge/state")
     more: dict[str, Any] = {"version": version}
@@ -78,7 +78,7 @@ async def test_newer_daemon_waits_until_the_first_is_gone(
     async with contextlib.AsyncExitStack() as newer:
         async with daemon_link(port, version) as older:
             await until(lambda: older.connected)
-            await asyncio.sleep(2.2)  # no longer a newcomer itself
+            await asyncio.sleep(2.2)  # after its own start period
 
             newcomer = await newer.enter_async_context(daemon_link(port, version))
             await until(lambda: bool(refusals(caplog)))
@@ -112,8 +112,8 @@ async def test_newer_daemon_publishes_nothing_and_leaves_the_first_connected(
         await asyncio.sleep(0.1)
         assert older.connects == 1
 
-        # The state that the older one stored before may arrive as retained: always with MQTT
-        # 3.1.1, and from the embedded broker if it was stored at the instant of the subscription.
+        # The earlier retained state of the older daemon may arrive: always with MQTT 3.1.1, and
+        # with the embedded broker if it was stored during the subscription.
         reader, new = watcher.messages(), list[Incoming]()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(0.1):
@@ -137,7 +137,7 @@ async def test_stored_state_of_a_dead_daemon_does_not_stop_a_new_one(
 
 @pytest.fixture
 def unseen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let no daemon find another one before it connects, as if both started together."""
+    """Make the daemons not detect each other before connecting, as if both started together."""
 
     async def is_in_use(settings: MqttSettings, offline: bytes) -> bool:
         del settings, offline
@@ -167,7 +167,7 @@ async def test_first_of_two_daemons_that_start_together_continues(
             assert (older.connects, newcomer.connects) == connects
 
     losses = [m for m in caplog.messages if "ended without a reason" in m]
-    assert len(losses) == 2  # one line of each daemon
+    assert len(losses) == 2  # one line from each daemon
     assert all("another client uses the client id 'jointfitd-jointfit-bench'" in m for m in losses)
     assert "check that the broker runs" not in caplog.text
 
@@ -177,7 +177,7 @@ CONNACK, TAKEN_OVER = b"\x20\x03\x00\x00\x00", b"\xe0\x02\x8e\x00"
 
 @pytest.mark.usefixtures("unseen")
 async def test_takeover_reason_of_the_broker_suffices(caplog: pytest.LogCaptureFixture) -> None:
-    """mosquitto 2.0.11 and iotcore give no reason; later releases of mosquitto do."""
+    """mosquitto 2.0.11 and iotcore send no reason; later releases of mosquitto do."""
     serving: list[asyncio.Task[None] | None] = []
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -206,7 +206,7 @@ async def test_broker_that_falls_silent_raises_no_suspicion(
         serving.append(asyncio.current_task())
         await reader.read(1000)
         writer.write(CONNACK)
-        while await reader.read(1000):  # reads everything, answers nothing
+        while await reader.read(1000):  # reads all bytes and sends no answer
             pass
         writer.close()
 
@@ -225,10 +225,10 @@ def test_one_short_connection_raises_suspicion_only_with_a_reason() -> None:
 
 
 def takeovers(first: TakeoverDetector, gap_s: float, handshake_s: float, reason: bool) -> list[int]:
-    """Return which of two daemons lost each connection, until one gives way.
+    """Return which of two daemons lost each connection, until one of them waits.
 
-    Daemon 1 connects `gap_s` after daemon 0. Each loss is followed by a wait of the publisher,
-    0.05 s doubled up to 0.6 s, of which a random part of at least one half is used.
+    Daemon 1 connects `gap_s` after daemon 0. A wait of the publisher follows each loss. It is 0.05
+    s, doubled up to 0.6 s, of which a random part of at least one half is used.
     """
     waits = random.Random(1)
     detectors, delays_s, lost = (first, TakeoverDetector()), [0.05, 0.05], []

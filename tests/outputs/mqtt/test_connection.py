@@ -1,4 +1,4 @@
-"""Connection to a real broker: losses, restarts, access rights, retained requests."""
+"""Connection to a real broker: losses, restarts, access rights and retained requests."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def settings(port: int, **more: Any) -> MqttSettings:
 
 
 class Link:
-    """A publisher at work, with everything it handed on."""
+    """A running publisher, and all requests that it passed on."""
 
     def __init__(self, port: int, **more: Any) -> None:
         self.outbox = Outbox(LIFE)
@@ -103,7 +103,7 @@ def test_a_connection_that_ended_without_a_reason_is_reported_as_lost() -> None:
 
 @contextlib.asynccontextmanager
 async def answering(connack: bytes) -> AsyncIterator[int]:
-    """Run a broker with this answer to every CONNECT; yield its port."""
+    """Run a broker that sends this answer to every CONNECT; yield its port."""
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await reader.read(1000)
@@ -151,7 +151,7 @@ async def test_stop_at_the_connack_is_not_lost(
     async def connected_after_all(client: aiomqtt.Client) -> aiomqtt.Client:
         made = await connect(client)
         link.cancel()
-        with contextlib.suppress(asyncio.CancelledError):  # as Python 3.11's wait_for may
+        with contextlib.suppress(asyncio.CancelledError):  # wait_for of Python 3.11 may raise it
             await asyncio.sleep(0)
         return made
 
@@ -168,7 +168,7 @@ async def until(condition: Callable[[], bool], within_s: float = 5.0) -> None:
 
 
 async def retained(port: int, wanted: int) -> dict[str, bytes]:
-    """Return what a newcomer finds, once there are `wanted` topics of it."""
+    """Return the retained messages for a new client when there are `wanted` topics."""
     found: dict[str, bytes] = {}
     async with asyncio.timeout(5), MqttConnection(settings(port)) as watcher:
         await watcher.subscribe([f"{BASE}/#"])
@@ -195,7 +195,7 @@ async def test_retained_state_is_restored_after_a_broker_restart(
         await until(lambda: link.publisher.connected)
         back_s = time.monotonic() - began
         assert await retained(broker.port, 21) == state | {LIFE: ONLINE}
-    assert back_s < 3  # the promise is 1 s; the machine may be busy
+    assert back_s < 3  # the specified time is 1 s; the machine may be busy
 
 
 async def test_absent_broker_at_start_is_awaited(broker: Broker) -> None:
@@ -453,7 +453,7 @@ async def test_client_raises_broker_lost_error(broker: Broker) -> None:
 
 
 async def test_connecting_can_be_cancelled_at_any_moment(broker: Broker) -> None:
-    broker.freeze()  # connects, never answers
+    broker.freeze()  # accepts connections but never answers
     connecting = asyncio.create_task(MqttConnection(settings(broker.port)).__aenter__())
     await asyncio.sleep(0.2)
     connecting.cancel()

@@ -47,7 +47,7 @@ def message(topic: str, payload: bytes, *, retained: bool) -> bytes:
 
 
 def passed_on(sent: bytes, chunk: int, admit: Callable[[str, bool], bool] | None = None) -> bytes:
-    """Return the bytes a reader gets, which reads as paho does: header byte by byte, then all."""
+    """Return the bytes for a reader that reads like paho: header byte by byte, then the rest."""
     ours, theirs = socket.socketpair()
     with ours, theirs:
         ours.setblocking(False)
@@ -55,7 +55,7 @@ def passed_on(sent: bytes, chunk: int, admit: Callable[[str, bool], bool] | None
         for start in range(0, len(sent), chunk):
             theirs.sendall(sent[start : start + chunk])
             idle = 0
-            while idle < 9:  # beyond the limit, several packets are dropped in one call
+            while idle < 9:  # several packets beyond the limit are dropped per call
                 try:
                     found += limited.recv(1 if len(found) % 2 else 1000)
                 except BlockingIOError:
@@ -85,7 +85,7 @@ def test_exactly_the_admitted_messages_are_passed_on(
         asked.append((topic, retained))
         return topic.startswith("a") and not retained
 
-    other = packet(7, 0xD0)  # not a message: passed on without a question
+    other = packet(7, 0xD0)  # not a message, so always passed on
     arriving = passed = b""
     within: list[tuple[str, bool]] = []
     for topic, length, retained in sent:
@@ -228,7 +228,7 @@ async def test_a_response_topic_that_the_broker_denies_costs_one_entry(
 
 @contextlib.asynccontextmanager
 async def poses(link: Link) -> AsyncIterator[None]:
-    """Put a hundred poses a second into the outbox."""
+    """Put 100 poses per second into the outbox."""
 
     async def put() -> None:
         while True:
@@ -248,7 +248,7 @@ async def poses(link: Link) -> AsyncIterator[None]:
 
 @contextlib.asynccontextmanager
 async def broken_broker(answer: bytes, *, reset: bool) -> AsyncIterator[tuple[int, list[float]]]:
-    """Yield the port of a server that takes CONNECT, sends `answer` and closes; and when it did."""
+    """Yield the port of a server that answers CONNECT and closes; yield the times of this."""
     tries: list[float] = []
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -272,8 +272,9 @@ async def test_broker_that_closes_during_the_handshake_is_retried_at_once(
 ) -> None:
     async with broken_broker(b"", reset=reset) as (port, tries):
         async with running(Link(port, version=version)):
-            await until(lambda: len(tries) >= 3, 2.5)  # one attempt took 3 s when it timed out
-        # The waits grow: 0.05 s, 0.1 s, 0.2 s, 0.4 s, then 0.6 s, each halved at most.
+            await until(lambda: len(tries) >= 3, 2.5)  # an attempt with a time-out would take 3 s
+        # The waits increase: 0.05 s, 0.1 s, 0.2 s, 0.4 s, then 0.6 s. Each wait is at least half of
+        # this value.
         assert len(tries) <= 8
 
 

@@ -1,4 +1,4 @@
-"""Payloads equal docs/mqtt.md."""
+"""The payloads equal the payloads in docs/mqtt.md."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def test_angles_have_the_names_of_their_convention(
 
 
 def bent(alpha_deg: float, beta_deg: float, gamma_deg: float) -> LimbState:
-    """Return the state with a shank turned against the thigh by Rz(gamma) Ry(beta) Rx(alpha)."""
+    """Return a state whose shank is rotated by Rz(gamma) Ry(beta) Rx(alpha) from the thigh."""
     turn = Rotation.from_euler("ZYX", [gamma_deg, beta_deg, alpha_deg], degrees=True)
     thigh = Rotation.from_quat([0.0094, -0.0251, 0.1276, 0.9914])
     q = [tuple(r.as_quat(scalar_first=True).tolist()) for r in (thigh, thigh * turn)]
@@ -219,7 +219,7 @@ def test_unknown_joint_is_null() -> None:
     }  # fmt: skip
 
 
-@example(1.797693134862316e304)  # finite, and not in hundredths of a degree
+@example(1.797693134862316e304)  # finite, but not in hundredths of a degree
 @given(st.floats(allow_nan=True, allow_infinity=True))
 def test_payload_contains_no_nan_or_infinity(value: float) -> None:
     joint = JointState("knee", (value, value, value), value, JointAngles(value, value, value))

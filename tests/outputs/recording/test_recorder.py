@@ -1,4 +1,4 @@
-"""The recorder starts, stops, rotates, deletes old files and survives failures of the disk."""
+"""The recorder: start, stop, rotation, deletion of old files, and disk failures."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_rotated_files_are_one_recording(tmp_path: Path) -> None:
         assert list(recording.events()) == some
         assert recording.gaps() == []
 
-    files[0].unlink()  # the next file contains the state of its beginning
+    files[0].unlink()  # the next file contains its initial state
     recording = open_recording(files[1])
     first, *rest = recording.events()
     assert isinstance(first, SourceOpened)
@@ -194,7 +194,7 @@ async def test_the_free_space_is_known_before_the_folder_exists(
 
 
 class FailingDisk:
-    """Fails every write beyond a limit."""
+    """Disk on which every write beyond a limit fails."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
         self.room_bytes: float = float("inf")

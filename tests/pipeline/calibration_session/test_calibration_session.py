@@ -72,7 +72,7 @@ def feed(
     sensors: tuple[str, ...] = SENSORS,
     cameras: bool = True,
 ) -> list[Output]:
-    """Feed sensors at 50 Hz, turning at `speed` rad/s, and mocap frames."""
+    """Send samples of sensors at 50 Hz, which turn at `speed` rad/s, and mocap frames."""
     out: list[Output] = []
     for k in range(round(start_s * 50), round(end_s * 50)):
         t_ns = k * SECOND // 50
@@ -195,7 +195,7 @@ def test_worse_calibration_is_rejected_with_the_reason() -> None:
     (status,) = only(outputs, CalibrationStatus)
     assert "knee 3.0" in status.text
     assert (status.level, status.kept) == ("warning", "knee 3.0 against 1.0 deg")
-    assert not only(outputs, Notice)  # the status is an event, too
+    assert not only(outputs, Notice)  # the status is also an event
 
 
 def test_job_contains_the_alignment_of_the_session() -> None:
@@ -270,7 +270,7 @@ def test_static_fit_uses_the_requested_length() -> None:
 
 
 def test_functional_fit_uses_the_requested_length_of_the_pose() -> None:
-    """An accepted pose must not be refused later."""
+    """The fit must not refuse an accepted pose later."""
     one = session()
     ask(one, 0, "static", seconds=1.5)
     (job,) = only(feed(one, 0, 5), FitJob)

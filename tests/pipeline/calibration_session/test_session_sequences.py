@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 SECOND = 1_000_000_000
 RATE = 10
-"""Samples a second: the least that is not silence is two."""
+"""Sample rate, Hz. At least two samples per second are necessary."""
 LEG = Chain(("hip", "knee", "ankle"), ("thigh", "shank"), (("S1",), ("S2",)))
 ARM = Chain(("hip", "knee", "ankle"), ("thigh", "shank"), (("S1",), ("S3",)))
 MARKERS = {segment: tuple(f"{segment}{k}" for k in range(3)) for segment in LEG.segments}
@@ -61,7 +61,7 @@ NO_FRAMES = OnlineFrames({}, {}, {})
 
 
 class SessionMachine(RuleBasedStateMachine):
-    """One session with the worker and the store around it, which may fail at any time."""
+    """One session with a worker and a store, which may fail at any time."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -72,7 +72,7 @@ class SessionMachine(RuleBasedStateMachine):
         self.jobs: list[FitJob] = []
         self.running: FitJob | None = None
         self.outdated: set[int] = set()
-        """Fits of trials before a restart of a sensor."""
+        """Numbers of fits whose trials precede a restart of a sensor."""
         self.session = self.new_session()
 
     def new_session(self) -> CalibrationSession:
@@ -95,7 +95,7 @@ class SessionMachine(RuleBasedStateMachine):
         return plain_calibration(self.chain, notes=(f"calibration {self.number}",))
 
     def take(self, outputs: list[Output]) -> list[Output]:
-        """Do with outputs what the supervisor does."""
+        """Process the outputs as the supervisor does."""
         for output in outputs:
             if isinstance(output, FitJob):
                 self.running = output
@@ -107,7 +107,7 @@ class SessionMachine(RuleBasedStateMachine):
         return outputs
 
     def ask(self, **arguments: Any) -> Reply:
-        """Send a request; a refused one changes nothing."""
+        """Send a request; a refused request must have no effect."""
         before = self.state()
         outputs = self.take(self.session.request(Request(self.t_ns, "calibrate", "t", arguments)))
         (reply,) = (output for output in outputs if isinstance(output, Reply))
@@ -116,13 +116,13 @@ class SessionMachine(RuleBasedStateMachine):
         return reply
 
     def state(self) -> tuple[object, ...]:
-        """Return what a request could change."""
+        """Return the state that a request could change."""
         one = self.session
         refits = (one.refits.paused, one.refits.job, one.refits.original)
         return one.phase, one.calibration, one.version, one.collecting, one._done, refits
 
     def move(self, seconds: float, speed: float, silent: Collection[str] = ()) -> None:
-        """Let the sensors and cameras send, except those that are `silent`."""
+        """Make the sensors and cameras send, except the `silent` ones."""
         for _ in range(round(seconds * RATE)):
             self.t_ns += SECOND // RATE
             for sensor in ("S1", "S2"):
@@ -135,7 +135,7 @@ class SessionMachine(RuleBasedStateMachine):
                 self.take(self.session.advance(self.t_ns))
 
     def finish(self, job: FitJob, outcome: str) -> None:
-        """Deliver the end of a job, of a cancelled one too: its result may be on its way."""
+        """Deliver the end of a job, also of a cancelled job whose result may be in transit."""
         if job is self.running:
             self.running = None
         result: dict[str, Any] = {"quality": {}}
@@ -237,7 +237,7 @@ class SessionMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.writes)
     @rule()
     def write_calibrations(self) -> None:
-        """The store writes one version after the other, and reports the last one."""
+        """Write the versions one after another, and report the last version."""
         for found in self.writes:
             self.stored[len(self.stored) + 1] = found
         self.writes = []
@@ -256,7 +256,7 @@ class SessionMachine(RuleBasedStateMachine):
 
     @rule()
     def restart_daemon(self) -> None:
-        """What was not written is lost, and what was written is in force."""
+        """Restart the daemon: unwritten results are lost, and the written calibration is active."""
         self.writes, self.jobs, self.running = [], [], None
         self.outdated.clear()
         self.session = self.new_session()
@@ -288,7 +288,7 @@ class SessionMachine(RuleBasedStateMachine):
 
     @override
     def teardown(self) -> None:
-        """From every state the session is aborted, and all phases are completed."""
+        """Abort the session from any state, then complete all phases."""
         assert self.ask(phase="abort").status == "ok"
         if self.chain is ARM or not self.mocap:
             self.reload(LEG, mocap=True)

@@ -1,4 +1,4 @@
-"""NatNet codec: real captures, the vendor's vector, and any bytes at all."""
+"""NatNet codec: real captures, the vendor's test vector, and arbitrary bytes."""
 
 from __future__ import annotations
 

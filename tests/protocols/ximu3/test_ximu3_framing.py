@@ -1,4 +1,4 @@
-"""x-IMU3 messages: any bytes, any cut, every byte accounted for."""
+"""x-IMU3 messages: any bytes in any chunks; every byte is accounted for."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_chunk_boundaries_do_not_change_the_messages(wire: bytes, cuts: list[int
 
 
 def changed(place: int, byte: int) -> bytes:
-    """Return a message of the usual kind with one other byte."""
+    """Return a message of the usual type with one changed byte."""
     usual = encode_data("Q", 1_000_000, (1.0, 0.0, 0.0, 0.0))
     return usual[:place] + bytes([byte]) + usual[place + 1 :]
 

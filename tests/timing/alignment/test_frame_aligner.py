@@ -24,11 +24,11 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0)
 VERDICTS = [verdict.value for verdict in SampleOutcome]
 
 Push = tuple[int, str, int]
-"""Arrival, stream, stamp."""
+"""Arrival time, stream and stamp of a sample."""
 
 
 def turned(t_ns: int, rate: float = 2.0) -> tuple[float, float, float, float]:
-    """Orientation of a body that turns about x at a constant rate, rad/s."""
+    """Return the orientation of a body that turns about x at a constant rate, rad/s."""
     half = rate * (t_ns - T0) * 1e-9 / 2
     return (cos(half), sin(half), 0.0, 0.0)
 
@@ -80,7 +80,7 @@ def test_a_frame_leaves_with_the_sample_that_completes_it() -> None:
         "B", 10 * MS, 50, phase=6 * MS, delay=MS
     )
     for frame in play(a, pushes):
-        assert frame.completed_ns == frame.t_ns + 7 * MS  # B's sample 6 ms later, 1 ms on its way
+        assert frame.completed_ns == frame.t_ns + 7 * MS  # B's sample 6 ms later, delayed by 1 ms
 
 
 @pytest.mark.parametrize("lost", [[40], [40, 41], [40, 41, 42, 43]])
@@ -136,7 +136,7 @@ def test_absent_samples_are_extrapolated_then_missing_then_not_awaited() -> None
         assert of[late].orientations["B"] == pytest.approx(turned(of[late].t_ns), abs=1e-12)
     assert of[530].missing == {"B"}
     assert "B" not in of[530].orientations
-    assert of[600].completed_ns == of[600].t_ns  # lost: nobody waits
+    assert of[600].completed_ns == of[600].t_ns  # the stream is lost, so the frame does not wait
     assert a.next_deadline_ns is not None
 
 
@@ -176,7 +176,7 @@ def test_a_stream_faster_than_the_frames_is_decimated() -> None:
     play(a, stream("A", 2_500_000, 400, phase=MS))
     counts = assert_accounted(a, "A")
     assert counts["decimated"] == pytest.approx(100, abs=4)
-    assert counts["used"] == pytest.approx(298, abs=4)  # two neighbors, and one before them
+    assert counts["used"] == pytest.approx(298, abs=4)  # two neighbours and one sample before them
 
 
 def test_a_slow_stream_is_interpolated_between_its_samples() -> None:
@@ -204,7 +204,7 @@ def test_a_reordered_sample_takes_its_place_and_a_late_one_does_not() -> None:
 
 def test_a_frame_does_not_remember_neighbors_that_a_reordered_sample_parted() -> None:
     found = []
-    for frames_before in (3, 0):  # at 0, 10 and 20 ms: the last two between 0 and 29 ms
+    for frames_before in (3, 0):  # frames at 0, 10 and 20 ms; the last two between 0 and 29 ms
         a = aligner(A=10 * MS)
         for t, rate in ((0, 2.0), (29, 2.0), (22, 9.0), (39, 2.0)):
             if t == 22:
@@ -227,9 +227,9 @@ def test_frames_without_orientations_go_on_while_all_streams_are_silent() -> Non
     assert all(not f.missing for t, f in of.items() if t < 1000 or t > 2010)
     silent = [f for t, f in of.items() if 1010 < t < 1990]
     assert all(f.missing == {"A", "B"} and not f.orientations for f in silent)
-    assert all(f.synced for f in silent)  # no stream ended
+    assert all(f.synced for f in silent)  # no stream has ended
     waited = [f.completed_ns - f.t_ns for f in silent]
-    assert waited[0] == 26 * MS  # 50 ms after the last sample both count as lost
+    assert waited[0] == 26 * MS  # both are lost 50 ms after the last sample
     assert set(waited[1:]) == {17_500_000}  # the usual delay, and one and a half periods
     assert a.skipped_frames == 0
     for name in "AB":
@@ -279,7 +279,7 @@ def test_frames_owed_for_long_are_passed_over() -> None:
 @pytest.mark.parametrize("delay", [300 * MS, 2_000 * MS])
 def test_a_stream_that_is_always_late_is_waited_for_while_it_is_the_only_one(delay: int) -> None:
     frames = play(aligner(A=10 * MS), stream("A", 10 * MS, 300, phase=2 * MS, delay=delay))
-    assert all(frame.orientations for frame in frames[2:])  # the first have one sample to go by
+    assert all(frame.orientations for frame in frames[2:])  # the first frames have one sample
     assert len(frames) > 290
 
 
@@ -297,7 +297,7 @@ def test_frames_are_not_interpolated_across_an_epoch() -> None:
 
 
 def test_frames_are_not_interpolated_across_a_gap() -> None:
-    """A comes late, so B's next sample is there when the frames of its gap go out."""
+    """A is late, so B's next sample has arrived when the frames of B's gap are output."""
     a = aligner(A=10 * MS, B=10 * MS)
     pushes = stream("A", 10 * MS, 100, delay=120 * MS)
     pushes += stream("B", 10 * MS, 100, phase=MS, delay=MS, lost=range(50, 58))
@@ -357,8 +357,8 @@ samples = st.tuples(
     st.sampled_from(["A", "B", "C"]),
     st.integers(-30 * MS, 60 * MS)
     | st.integers(-(10**13), 10**13)
-    | st.sampled_from([0, 10 * MS]),  # stamp against the one before
-    st.integers(0, 40 * MS) | st.integers(0, 10**11),  # arrival after the one before
+    | st.sampled_from([0, 10 * MS]),  # stamp minus previous stamp
+    st.integers(0, 40 * MS) | st.integers(0, 10**11),  # arrival minus previous arrival
     st.integers(0, 2) | st.just(0),  # epoch
 )
 actions = st.one_of(
@@ -415,8 +415,8 @@ streams = st.fixed_dictionaries(
         "phase": st.integers(0, 40 * MS),
         "delay": st.integers(0, 30 * MS),
         "jitter": st.integers(0, 12 * MS),
-        "gap": st.tuples(st.integers(0, 900), st.integers(0, 400)),  # begin and length, ms
-        "restart": st.integers(0, 2_000),  # ms; beyond a second: none
+        "gap": st.tuples(st.integers(0, 900), st.integers(0, 400)),  # start and length, ms
+        "restart": st.integers(0, 2_000),  # ms; no restart beyond a second
         "every_twice": st.integers(3, 50),
         "every_lost": st.integers(3, 50),
     }
@@ -424,7 +424,7 @@ streams = st.fixed_dictionaries(
 
 
 def sent(name: str, given_by: dict[str, Any], dice: Random) -> list[tuple[int, str, int, int]]:
-    """Return arrival, stream, stamp and epoch of a second of samples of one device."""
+    """Return arrival, stream, stamp and epoch of one device's samples in one second."""
     found = []
     begin, length = given_by["gap"]
     for k in range(1_000 * MS // given_by["period"]):
@@ -469,6 +469,6 @@ def test_every_sample_has_one_outcome_and_frames_are_correct_for_any_device(
         assert early[name] <= counts["late"] + counts["duplicate"] + counts["dropped"]
     assert all(one.t_ns < other.t_ns for one, other in pairwise(frames))
     assert all(one.completed_ns <= other.completed_ns for one, other in pairwise(frames))
-    for frame in frames:  # a constant turn is met exactly, between samples and beyond
+    for frame in frames:  # a constant rate is reproduced exactly, also beyond the samples
         for q in frame.orientations.values():
             assert q == pytest.approx(turned(frame.t_ns), abs=1e-9)

@@ -30,13 +30,13 @@ Delay: TypeAlias = Callable[[np.random.Generator, int], "NDArray[np.float64]"]
 
 
 def exponential(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
-    """0.3 ms of jitter, 2 % spikes."""
+    """Return delays with 0.3 ms of jitter and 2 % of spikes."""
     spikes = (rng.random(n) < 0.02) * rng.uniform(5e6, 20e6, n)
     return rng.exponential(3e5, n) + spikes
 
 
 def latency_timer(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
-    """USB bridge with its timer at 16 ms."""
+    """Return delays of a USB bridge with a latency timer of 16 ms."""
     return rng.uniform(0, 16e6, n)
 
 
@@ -45,7 +45,7 @@ def punctual(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
 
 
 class Device:
-    """A device with a skewed clock, sampled at true host instants."""
+    """A device with a clock skew, whose samples have true host times."""
 
     def __init__(self, seed: int = 0, *, skew: float | None = None, first: int = 1000) -> None:
         self.rng = np.random.default_rng(seed)
@@ -55,7 +55,7 @@ class Device:
     def samples(
         self, seconds: float, delay: Delay, start: int = START
     ) -> Iterable[tuple[int, int, int, int]]:
-        """Yield true host instant, device microseconds, counter, arrival."""
+        """Yield true host time, device time (µs), counter, and arrival of every sample."""
         true = start + PERIOD * np.arange(int(seconds * S / PERIOD))
         arrivals = np.maximum.accumulate(true + delay(self.rng, len(true)).astype(np.int64))
         ticks = self.first + ((true - start) / (1 + self.skew) / 1000).astype(np.int64)
@@ -81,7 +81,7 @@ def errors_of(
 
 
 def after(errors: NDArray[np.float64], seconds: float) -> float:
-    """Worst error in the second that follows, ms."""
+    """Return the largest error in the second after `seconds`, ms."""
     at = int(seconds * S / PERIOD)
     return float(errors[at : at + S // PERIOD].max()) / MS
 
@@ -109,7 +109,7 @@ def test_passive_clocks_reach_their_accuracy(
 @pytest.mark.parametrize("delay", [exponential, latency_timer])
 @pytest.mark.parametrize(("use", "state"), [("counter", "passive"), ("nothing", "arrival")])
 def test_devices_without_time_are_stamped_evenly(delay: Delay, use: str, state: str) -> None:
-    clock = DeviceClock(10_020_000)  # its nominal period is off by 2000 ppm
+    clock = DeviceClock(10_020_000)  # the nominal period has an error of 2000 ppm
     errors, stamps = errors_of(clock, Device(1).samples(40, delay), use)
     assert errors[1500:].max() <= 0.2 * MS
     assert clock.state == state
@@ -131,7 +131,7 @@ def test_a_better_estimate_is_slewed_to_and_sigma_contains_the_difference() -> N
                Device(13, skew=0.0).samples(12, punctual)]  # fmt: skip
     errors, stamps = errors_of(DeviceClock(PERIOD), samples)
     steps = [b.t_ns - a.t_ns for a, b in pairwise(stamps[990:])]
-    assert max(abs(step - PERIOD) for step in steps) < 800e-6 * PERIOD  # and the skew
+    assert max(abs(step - PERIOD) for step in steps) < 800e-6 * PERIOD  # plus the skew
     assert errors[-1] < errors[1000]
     assert stamps[1005].sigma_ns > 2.5 * MS
 
@@ -228,7 +228,7 @@ def test_clock_is_not_synced_after_a_restart_until_it_has_settled(first: int) ->
     clock, stamps = restarted(first)
     assert clock.epoch == 1
     assert not any(stamp.synced for stamp in stamps[:150])
-    assert all(stamp.synced for stamp in stamps[400:])  # settled within 5 s
+    assert all(stamp.synced for stamp in stamps[400:])  # converged within 5 s
 
 
 def test_a_counter_reset_is_a_restart() -> None:
@@ -239,7 +239,7 @@ def test_a_counter_reset_is_a_restart() -> None:
 def test_a_clock_that_jumps_while_its_counter_does_not_is_a_restart() -> None:
     clock = DeviceClock(PERIOD)
     for k in range(3000):
-        jumped = 300_000 if k >= 2000 else 0  # late by 0.3 s: no arrival contradicts it for 2 s
+        jumped = 300_000 if k >= 2000 else 0  # 0.3 s late, which no arrival contradicts for 2 s
         clock.feed_sample(
             1000 + k * 10_000 + jumped, k, START + k * PERIOD + jumped * 1000, MICROSECONDS
         )
@@ -255,7 +255,7 @@ def test_backlog_that_ends_while_the_counter_stands_is_no_restart(
     clock, silent = DeviceClock(PERIOD), round(stall * S)
     first = 100 * S // 1000  # the device has run for 100 s
     for k in range(4000):
-        late = 3000 <= k < 3020  # sampled before the stall, received together after it
+        late = 3000 <= k < 3020  # sampled before the pause, received together after it
         stood = silent if k >= 3020 else 0
         arrival = START + (3000 * PERIOD + silent + k if late else k * PERIOD + stood)
         if k == 3000 and reopened:
@@ -267,7 +267,7 @@ def test_backlog_that_ends_while_the_counter_stands_is_no_restart(
 
 
 class SentFrame(NamedTuple):
-    """Frame of a server: number, exposure and arrival, ns since the start."""
+    """Frame of a server, with number, exposure and arrival, ns since the start."""
 
     number: int
     exposed_ns: int
@@ -275,7 +275,7 @@ class SentFrame(NamedTuple):
 
 
 def frames_of_a_paused_server(stall_ns: int, still_late_ns: int) -> list[SentFrame]:
-    """Return 10 s of frames, 0.2 s sent after a pause, 0.2 s still late, and 10 s in time."""
+    """Return frames of 10 s, then 0.2 s after a pause, 0.2 s still late, and 10 s in time."""
     exposed = PERIOD * np.arange(2000)
     exposed[1020:] += stall_ns
     arrived = exposed + 5 * MS
@@ -287,9 +287,9 @@ def frames_of_a_paused_server(stall_ns: int, still_late_ns: int) -> list[SentFra
 def clock_of_a_server(
     frames: list[SentFrame], tick_clock: TickClock, *, jump_ns: int = 0, jump_at: int = 1 << 60
 ) -> DeviceClock:
-    """Return the clock of a server that answers ten echoes a second, if its clock is its own.
+    """Return the clock of a server that answers ten echoes per second if it has its own clock.
 
-    The server's clock jumps by `jump_ns` at frame `jump_at`. Time is right in the last second.
+    The server's clock jumps by `jump_ns` at frame `jump_at`. In the last second, its time is right.
     """
     clock, asked = DeviceClock(PERIOD), 0
     errors = []
@@ -317,7 +317,7 @@ PTP = TickClock(1, None, 10_000_000, "unix")
 def test_a_server_that_pauses_and_skips_frames_has_no_clock_jump(
     server: TickClock, stall: float, still_late: float
 ) -> None:
-    """It sends the frames from before the pause late; later frames continue their numbers."""
+    """The server sends earlier frames late; the numbers of later frames continue."""
     frames = frames_of_a_paused_server(round(stall * S), round(still_late * stall * S))
     clock = clock_of_a_server(frames, server)
     assert clock.epoch == 0
@@ -326,7 +326,7 @@ def test_a_server_that_pauses_and_skips_frames_has_no_clock_jump(
 
 @pytest.mark.parametrize("received", [0, 100, 400], ids="buffer of {} frames".format)
 def test_a_stopped_daemon_sees_no_clock_jump(received: int) -> None:
-    """It reads the frames of four seconds at once; the socket's buffer dropped the last ones."""
+    """The daemon reads frames of four seconds at once; the socket's buffer dropped the rest."""
     frames = [SentFrame(k, k * PERIOD, max(k * PERIOD, 1400 * PERIOD * (k >= 1000)) + 5 * MS)
               for k in range(2400) if not 1000 + received <= k < 1400]  # fmt: skip
     clock = clock_of_a_server(frames, SERVER)
@@ -344,7 +344,7 @@ def test_a_jump_of_a_server_is_reported(jump: float) -> None:
 
 @pytest.mark.parametrize("jump", [2.0, 6.0])
 def test_a_jump_at_the_end_of_a_pause_is_reported(jump: float) -> None:
-    """It is reported whether the four seconds of the pause are shorter or longer than the jump."""
+    """The jump is reported if it is longer or shorter than the pause of four seconds."""
     frames = frames_of_a_paused_server(4 * S, 0)
     clock = clock_of_a_server(frames, SERVER, jump_ns=round(jump * S), jump_at=1020)
     assert clock.epoch == 1
@@ -352,7 +352,7 @@ def test_a_jump_at_the_end_of_a_pause_is_reported(jump: float) -> None:
 
 
 def test_samples_that_stay_late_are_a_restart_after_two_seconds() -> None:
-    """The device paused for 0.3 s and its clock with it, and no counter tells."""
+    """Device and clock paused for 0.3 s, and no counter reveals the pause."""
     clock = DeviceClock(PERIOD)
     epochs = {}
     for true, ticks, number, arrival in Device(14).samples(20, punctual):
@@ -383,7 +383,7 @@ def test_a_gap_shared_by_the_counter_is_no_restart() -> None:
 
 
 def test_stale_bytes_before_fresh_ones_do_not_spoil_the_clock() -> None:
-    """Minutes-old samples from a full buffer come first, all at once."""
+    """Samples from a full buffer, which are minutes old, arrive first and at once."""
     device = Device(10)
     samples = list(device.samples(200, punctual))
     stale = [(t, u, c, START + 195 * S + c * 1000) for t, u, c, _ in samples[:40]]
@@ -399,7 +399,7 @@ def test_a_restart_reported_by_the_decoder_is_one() -> None:
     clock = DeviceClock(PERIOD)
     errors_of(clock, Device(11).samples(5, punctual))
     clock.feed_restart()
-    clock.feed_restart()  # nothing has been since: not another
+    clock.feed_restart()  # no sample since, so no second restart
     assert clock.epoch == 1
     assert clock.state == "settling"
     assert clock.skew_ppm is None
@@ -446,7 +446,7 @@ def test_mapped_time_is_monotonic(
         assert stamp.sigma_ns >= 0
         if stamp.t_ns > newest:
             newest = stamp.t_ns
-        elif not stamp.duplicate:  # only a sample the device itself calls older may be older
+        elif not stamp.duplicate:  # only a sample with an older device time may be older
             assert ticks is not None or counter is not None
 
 

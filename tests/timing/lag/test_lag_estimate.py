@@ -1,4 +1,4 @@
-"""The lag: right on real data, honest about its sigma, and refused where it cannot be known."""
+"""Lag estimates: accuracy on real data, coverage of sigma, and refusal without information."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_a_rate_stamped_at_the_left_sample_would_be_found_out(excerpt: Excerpt) 
 
 
 def test_ten_seconds_at_camera_rate_suffice(excerpt: Excerpt) -> None:
-    """Optics at 120 Hz and a random phase, a random lag added: how what is found spreads."""
+    """Scatter of the estimates with optics at 120 Hz, random phase and random lag."""
     rng = np.random.default_rng(7)
     optical = Rotation.from_quat(excerpt.optical, scalar_first=True)
     found, sigmas = [], []
@@ -109,7 +109,7 @@ def test_gaps_do_not_move_the_lag(excerpt: Excerpt) -> None:
 
 
 def test_orientations_lead_the_gyro_they_are_made_of(excerpt: Excerpt) -> None:
-    """Strapdown integration: half a sample earlier than the gyro, so never carry a lag over."""
+    """Integrated orientations lead the gyroscope by half a sample, so lags are not reusable."""
     steps = Rotation.from_rotvec(excerpt.gyro * 7 / 2000)
     path = [Rotation.identity()]
     for step in steps[571:4000]:
@@ -153,7 +153,7 @@ def test_wrong_conventions_are_refused(excerpt: Excerpt) -> None:
 
 
 def motion(seed: int, seconds: float, rate: float = 250.0) -> Rotation:
-    """A smooth irregular rotation, sampled every 0.5 ms from t = 0."""
+    """Return a smooth irregular rotation, sampled every 0.5 ms from t = 0."""
     rng = np.random.default_rng(seed)
     t = np.arange(0, seconds, 0.0005)
     w = sum(
@@ -225,7 +225,7 @@ def test_either_stream_may_be_the_faster_one() -> None:
 
 
 def test_sigma_is_honest() -> None:
-    """Deviations divided by their own sigma spread by about one over independent windows."""
+    """The errors divided by their sigma have a deviation of about one over the windows."""
     ratios = []
     for seed in range(16):
         estimate = estimate_lag(*made_up(seed, 5 * MS, noise=0.004, seconds=6.0))
@@ -274,12 +274,13 @@ def test_periodic_motion_is_ambiguous_in_a_wide_search() -> None:
     refused = estimate_lag(t_ns, q, t_ns, q, LagSettings(span_s=3.0)).refused
     assert refused is not None
     assert "periodic" in refused
-    assert estimate_lag(t_ns, q, t_ns, q).refused is None  # mapped clocks: the near one is right
+    assert estimate_lag(t_ns, q, t_ns, q).refused is None  # mapped clocks: nearest lag
 
 
 @pytest.mark.parametrize("span_s", [0.5, 1.0, 3.0])
 def test_rounding_does_not_decide_the_rejection_of_periodic_motion(span_s: float) -> None:
-    # The magnitude repeats every 0.5 s, so the border of each search correlates as well as zero.
+    # The magnitude repeats every 0.5 s, so the correlation at the border of each search equals that
+    # at zero.
     t = np.arange(0, 12, 0.01)
     t_ns = (t * 1e9).astype(np.int64)
     angle = 2.0 * np.sin(2 * np.pi * t)[:, None] * [1, 0, 0]
@@ -340,7 +341,7 @@ def test_a_step_is_reported_once_and_an_outlier_never() -> None:
     ]
     assert len(steps) == 1
     number, step_ns = steps[0]
-    assert number - 21 < 8  # windows of 2.5 s: within 20 s
+    assert number - 21 < 8  # windows of 2.5 s, so within 20 s
     assert step_ns / MS == pytest.approx(3.0, abs=0.5)
 
 

@@ -130,7 +130,7 @@ def test_movement_lines_contain_one_line_per_joint() -> None:
     knee = {"met": False, "source": "sensors", "predicted_error_mm": None, "bends": 3}
     ankle = {"met": False, "source": "unknown", "bends": 1}
     assert movement_lines({"joints": {"hip": hip, "knee": knee, "ankle": ankle}}) == [
-        "✔ hip: center ± 16.7 mm, random error 2.2 mm, 64° range",  # upwards, as the target's text
+        "✔ hip: center ± 16.7 mm, random error 2.2 mm, 64° range",  # as in the target's text
         "… knee: center unknown, 3 bends, from sensors",
         "… ankle: center unknown, 1 bend",
     ]
@@ -170,7 +170,7 @@ async def interrupted(phase: str, *states: Mapping[str, object]) -> object:
     waiting = asyncio.create_task(one.wait_for_end(phase))
     await asyncio.sleep(0)
     assert one.on_state("offline") == "the daemon is offline: waiting up to 60 s for it"
-    assert one.on_state("offline") is None  # said once
+    assert one.on_state("offline") is None  # reported once
     for status in states:
         one.on_status(status)
     assert one.on_state("online") == "the daemon is online again"
@@ -215,7 +215,7 @@ async def test_state_of_the_daemon_between_phases_is_not_reported() -> None:
 
 
 class SilentDaemon:
-    """Stands in for a client whose requests are never answered."""
+    """Replacement for a client whose requests are never answered."""
 
     def __init__(self) -> None:
         self.asked: list[str] = []

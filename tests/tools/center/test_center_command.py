@@ -1,4 +1,4 @@
-"""`jointfit center` as a user runs it, on trials whose center is known."""
+"""The command `jointfit center` as a user runs it, on trials with known center."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ NAMES = ("P1", "P2", "P3", "P4", "C1", "C2", "C3", "C4")
 PARENT = np.array([[0.0, 0.0, 0.1], [0.0, 0.12, 0.1], [0.05, 0.0, 0.25], [-0.06, 0.05, 0.3]])
 CHILD = np.array([[0.05, 0.0, -0.2], [-0.05, 0.03, -0.25], [0.02, 0.06, -0.3], [0.0, -0.06, -0.2]])
 CENTER = np.array([0.01, 0.02, -0.15])
-"""In the coordinates of PARENT; CHILD is about it."""
+"""Center in the coordinates of PARENT. CHILD surrounds it."""
 OPTIONS = ["--parent", "P1,P2,P3,P4", "--markers", "C1,C2,C3,C4"]
 
 
 def ball_trial(noise: float = 0.0005, frames: int = 400, span: float = 1.0) -> MarkerTrajectories:
-    """Return a ball joint turned in all directions while the parent moves; y is up."""
+    """Return a ball joint that turns in all directions while the parent moves; y is up."""
     rng = np.random.default_rng(4)
     t = np.arange(frames) / 100.0
     parent = Rotation.from_rotvec(0.3 * np.stack((np.sin(t), np.cos(0.7 * t), 0.2 * t), axis=1))
@@ -47,7 +47,7 @@ def ball_trial(noise: float = 0.0005, frames: int = 400, span: float = 1.0) -> M
 
 
 def hinge_trial() -> MarkerTrajectories:
-    """Return a joint that turns about x only, beside a parent at rest; y is up."""
+    """Return a joint that turns about x only, with the parent at rest; y is up."""
     rng = np.random.default_rng(4)
     t = np.arange(400) / 100.0
     turn = Rotation.from_rotvec(np.outer(0.8 * np.sin(2 * t), (1.0, 0.0, 0.0)))
@@ -60,7 +60,7 @@ def hinge_trial() -> MarkerTrajectories:
 
 
 def expected_in_parent() -> NDArray[np.float64]:
-    """Return CENTER by the rule of the axes, written down independently."""
+    """Return CENTER from the definition of the axes, computed independently."""
     x = PARENT[1] - PARENT[0]
     normal = np.cross(x, PARENT[2] - PARENT[0])
     ex, ez = x / np.linalg.norm(x), normal / np.linalg.norm(normal)
@@ -93,7 +93,7 @@ def test_the_place_in_the_world_is_in_the_files_axes_at_the_mean_pose(tmp_path: 
     still = ball_trial(noise=0.0)
     parent = still.positions[:, :4]
     moved = still.positions.copy()
-    # take the parent's motion out: the mean pose is then every pose
+    # Remove the parent's motion, so the mean pose equals every pose.
     for i in range(len(moved)):
         a = parent[i] - parent[i].mean(axis=0)
         b = parent[0] - parent[0].mean(axis=0)
@@ -151,7 +151,7 @@ def test_two_parent_markers_and_one_of_the_child_are_enough_in_a_plane(tmp_path:
     asked = ["--parent", "A,B", "--markers", "C", "--plane", "z"]
     for method in ("auto", "hyper"):
         found = answer(tmp_path / "plane.trc", *asked, "--method", method)
-        # x from A to B points down, the center is 0.2 m below their middle
+        # The x axis from A to B points down, and the center is 0.2 m below their middle.
         np.testing.assert_allclose(found["center_parent_m"], [0.2, 0.0], atol=0.002)
         np.testing.assert_allclose(found["center_world_m"][2], 1.0, atol=0.001)
     refused = run(app, ["center", str(tmp_path / "plane.trc"), *asked[:4]])

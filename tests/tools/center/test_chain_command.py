@@ -34,7 +34,7 @@ MARKERS = {
     "C2": (2, (-0.02, -0.28)),
     "F": (3, (0.15, -0.04)),
 }
-"""Segment and position from its proximal joint (pelvis: from the hip), m."""
+"""Segment of each marker, and position relative to its proximal joint (pelvis: hip), m."""
 CHAIN = [
     *("--segment", "P", "--segment", "T1,T2", "--segment", "C1,C2", "--segment", "F"),
     *("--joints", "hip,knee,ankle", "--plane", "z"),
@@ -45,7 +45,7 @@ RATE_HZ, FRAMES = 50.0, 600
 def planar_chain(
     *, noise: float = 0.0005, moving: bool = True, seed: int = 1
 ) -> tuple[MarkerTrajectories, Array]:
-    """Return a planar chain in x and y (up), and its joints, m, shape (frames, 3 joints, 2)."""
+    """Return a planar chain in x and y (up), and its joints, m, shape (frames, 3, 2)."""
     t = np.arange(FRAMES) / RATE_HZ
     scale = 1.0 if moving else 0.02
     bends = np.stack(
@@ -72,7 +72,7 @@ def planar_chain(
 
 
 def reconstruct(folder: Path, trial: MarkerTrajectories, *options: str, code: int = 0) -> Any:
-    """Run the command on a trial and return its JSON object."""
+    """Run the command on a trial; return its JSON object."""
     write_trc(folder / "chain.trc", trial)
     result = run(app, ["center", str(folder / "chain.trc"), *options, "--json"])
     assert result.exit_code == code, result.stderr
@@ -105,7 +105,7 @@ def test_gaps_are_only_where_no_segment_of_the_joint_is_visible(tmp_path: Path) 
     known = np.asarray(np.isfinite(positions(found)).all(axis=2))
     hidden = np.zeros(FRAMES, dtype=bool)
     hidden[100:350] = True
-    assert (known[:, 0] == ~hidden).all()  # the hip is measured from the thigh alone
+    assert (known[:, 0] == ~hidden).all()  # the thigh alone determines the hip
     assert known[:, 1:].all()  # the shank determines the knee and the ankle
     assert found["joints"][0]["longest_gap_s"] == pytest.approx(5.0)
     off = positions(found)[..., :2] - truth
@@ -180,7 +180,8 @@ def test_all_joints_of_a_simulated_leg_are_found_in_space(tmp_path: Path) -> Non
     rms = np.sqrt(((positions(found) - truth) ** 2).sum(axis=2).mean(axis=0))
     assert rms[0] < 0.002
     assert rms[2] < 0.003
-    # along the axis of the knee no position is observable; across it, the thigh ends at the knee
+    # Along the axis of the knee, no position is observable. Perpendicular to it, the thigh ends at
+    # the knee.
     length = np.linalg.norm(positions(found)[:, 1] - positions(found)[:, 0], axis=1)
     assert length.std() < 0.002
 

@@ -1,6 +1,7 @@
-"""A rig that only publishes: the topics of a calibrated leg, without daemon, sensors and simulator.
+"""A rig that publishes the topics of a calibrated leg, without daemon, sensors and simulator.
 
-The page is tested with it where no calibration is needed: it starts at once and costs no CPU time.
+Tests of the page use it if they need no calibration, because it starts at once and needs no CPU
+time.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
 PERIOD_S = 0.1
-"""Interval of `pose/ui`, s."""
+"""Time between two messages `pose/ui`, s."""
 HEALTH_POSES = 20
-"""Poses from one health message to the next."""
+"""Number of poses between two health messages."""
 WRITTEN_BYTES_S = 66_600
 """Growth of a recording, bytes/s: four IMUs at 100 Hz."""
 THIGH_M, SHANK_M = 0.43, 0.39
@@ -88,7 +89,7 @@ STOPPED = {
     "file": "", "duration_s": 0.0, "written_bytes": 0, "lost": 0, "failure": None,
     "free_bytes": 93_200_000_000, "active": False,
 }  # fmt: skip
-"""The same without any recording."""
+"""State of the recording if there is none."""
 
 
 @dataclass
@@ -103,7 +104,7 @@ class PublishedRig:
     clock_offset_s: float = 0.0
     """Clock of the gateway minus clock of this machine, s."""
     lengths_known: bool = True
-    """Whether the lengths of the segments are known, and so the positions of knee and ankle."""
+    """Whether the lengths of the segments, and thus the positions of knee and ankle, are known."""
     calibrated: bool = True
     """Whether orientations and angles are known."""
     offline: frozenset[str] = frozenset()
@@ -113,17 +114,17 @@ class PublishedRig:
     account: tuple[str | None, str | None] = (None, None)
     """User name and password of the broker."""
     silent: bool = False
-    """Whether the rig hangs: it sends no poses, but keeps its connection."""
+    """Whether the rig sends no poses but remains connected."""
     requests: list[dict[str, Any]] = field(default_factory=list)
-    """Requests received, without the check of rights that a page sends once."""
+    """Received requests, except the permission check that a page sends once."""
     commands: list[str] = field(default_factory=list)
-    """Their commands."""
+    """Commands of the received requests."""
     turned: dict[str, tuple[str, float]] = field(default_factory=dict)
     """Axis and angle, deg, by which a sensor was turned about its own axis."""
     changes: dict[str, Any] = field(default_factory=dict)
-    """Keys of `calibration` with other values."""
+    """Changed values of the message `calibration`, by key."""
     progress: dict[str, Any] | None = None
-    """Content of `calibration/progress`, of a rig that calibrates."""
+    """Content of `calibration/progress` during a calibration."""
     answer: dict[str, Any] = field(
         default_factory=lambda: {"status": "accepted", "data": {}, "error": None}
     )
@@ -131,11 +132,11 @@ class PublishedRig:
     recording: dict[str, Any] = field(default_factory=lambda: dict(RECORDING))
     """State of the recording, which requests change."""
     marks: int = 0
-    """Number of marks that were set."""
+    """Number of received marks."""
     answers: dict[str, dict[str, Any]] = field(
         default_factory=lambda: {"calibrations": {"status": "ok", "data": STORED}}
     )
-    """Answers by command; `answer` to all others but `record` and `mark`."""
+    """Answers by command. All other commands except `record` and `mark` receive `answer`."""
     _began_s: float = field(default_factory=time.monotonic)
 
     @property
@@ -151,7 +152,7 @@ class PublishedRig:
         return time.time_ns() // 1000 + int(self.clock_offset_s * 1e6)
 
     def retained(self) -> dict[str, dict[str, Any]]:
-        """Return the retained messages, those of a rig that is online."""
+        """Return the retained messages of a rig that is online."""
         messages: dict[str, dict[str, Any]] = {
             "bridge/info": {
                 "v": 1, "software": "0.1.0", "rig": self.name, "output_rate_hz": 100.0,
@@ -254,7 +255,7 @@ class PublishedRig:
         } | self.changes  # fmt: skip
 
     def poses(self, seq: int) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return `pose/ui` and `optical/pose` of this instant: a walk."""
+        """Return `pose/ui` and `optical/pose` of a walking subject at the current time."""
         t_us = self.now_us()
         angle = 2.0 * math.pi * t_us / 1e6 / STEP_S
         hip = math.radians(22.0) * math.cos(angle)
@@ -271,7 +272,7 @@ class PublishedRig:
         return pose | {"flags": []}, optical | {"v": 1, "t_us": t_us, "frame": seq}
 
     def orientations(self) -> dict[str, Any]:
-        """Return `sensors/pose`: sensors with different headings, each turned by `turned`."""
+        """Return `sensors/pose` for sensors with different headings, each rotated by `turned`."""
         sensors = {}
         for i, name in enumerate(name for group in self.sensors.values() for name in group):
             axis, degrees = self.turned.get(name, ("x", 0.0))
@@ -316,7 +317,7 @@ class PublishedRig:
 
 @contextlib.asynccontextmanager
 async def publishing(rig: PublishedRig, port: int) -> AsyncIterator[None]:
-    """Publish the topics of a rig until the end of the block; reconnect like the daemon."""
+    """Publish the topics of a rig during the block; reconnect like the daemon."""
     task = asyncio.create_task(_publish(rig, port), name="published rig")
     try:
         yield
@@ -348,7 +349,7 @@ async def _publish(rig: PublishedRig, port: int) -> None:
                     while not answers.done():
                         answers.cancel()
                         await asyncio.wait([answers], timeout=1.0)
-                    # a client that disconnects orderly has no will
+                    # The broker sends no will message for a client that disconnects.
                     await client.publish(will.topic, will.payload, 1, retain=True)
         await asyncio.sleep(0.2)
 

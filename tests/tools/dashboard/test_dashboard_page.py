@@ -1,4 +1,4 @@
-"""The dashboard's page in Chromium, on a rig that only publishes: drawing, words, recovery."""
+"""The dashboard's page in Chromium with a published rig: drawing, texts and recovery."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ CUT_OFF = """() => {
   const wrapped = shown('.button').filter((button) => button.getBoundingClientRect().height > 46);
   return [...tables, ...wrapped].map((element) => element.ariaLabel ?? element.textContent);
 }"""
-"""Tables of the present view that are wider than their place, and buttons of two lines."""
+"""JavaScript that returns tables wider than the view, and buttons with two lines."""
 
 
 async def test_the_limb_moves_and_the_angle_has_a_standard_deviation(broker: Broker) -> None:
     async with shown(broker, PublishedRig()) as page:
         assert await page.text("#rig-name") == "bench-1"
-        # The age is known from the first pose on, which has the time of the gateway.
+        # The age is known after the first pose, which contains the time of the gateway.
         await page.until_text("#rig-state", "Calibrated, version 3, 2 h ago")
         assert await page.text("#angle-title") == "Knee flexion"
         assert await page.text("#angle-sd") == "± 2.1°"
@@ -170,7 +170,11 @@ TICKS = "[...document.querySelectorAll('.rail .done .rail-title')].map((each) =>
         ({"phase": "functional", "done": ["align", "static"]}, ["Align", "Stand still"]),
         ({"phase": "fitting", "text": "fitting the static trial", "done": ["align"]}, ["Align"]),
         (
-            {"phase": "static", "version": 3, "done": ["static"]},  # again, for one in force
+            {
+                "phase": "static",
+                "version": 3,
+                "done": ["static"],
+            },  # repeated for an active one
             ["Align", "Move"],
         ),
     ],

@@ -40,7 +40,7 @@ NOWHERE = BrokerAddress(HOST, 1)
 
 
 async def get(url: str, path: str = "", **headers: str) -> tuple[int, dict[str, str], bytes]:
-    """Return status, headers and body; the path is sent as it is."""
+    """Return status, headers and body; the path is sent unchanged."""
     host, port = url.removeprefix("http://").rstrip("/").split(":")
     reader, writer = await asyncio.open_connection(host, int(port))
     named = {"Host": f"{host}:{port}"} | {key.replace("_", "-"): v for key, v in headers.items()}
@@ -116,7 +116,7 @@ async def test_pages_of_other_origins_cannot_use_the_tunnel() -> None:
 
 
 async def round_trip(url: str) -> bytes:
-    """Publish a message through the tunnel and return it as received through the tunnel."""
+    """Publish a message through the tunnel; return it as received through the tunnel."""
     async with aiomqtt.Client(
         HOST, int(url.rstrip("/").rpartition(":")[2]), transport="websockets",
         websocket_path="/mqtt", protocol=aiomqtt.ProtocolVersion.V5,
@@ -143,7 +143,7 @@ def open_tunnel(url: str) -> connect:
 
 
 async def close_of_tunnel(url: str) -> tuple[int, str]:
-    """Return code and reason with which the server closes the tunnel."""
+    """Return the code and the reason with which the server closes the tunnel."""
     async with open_tunnel(url) as websocket:
         with pytest.raises(ConnectionClosed) as closed:
             await websocket.recv()
@@ -203,7 +203,7 @@ async def test_a_page_that_does_not_read_holds_the_broker_back_instead_of_fillin
                 await asyncio.sleep(0.2)
         writer.transport.abort()
     broker.close()
-    # Buffers of the kernel for two connections on the loopback have some megabytes each.
+    # The kernel's buffers for two loopback connections have some megabytes each.
     assert sent_bytes < 32e6
 
 
@@ -293,7 +293,7 @@ STOPPED = [
         id="SIGTERM, where the shell ignores SIGINT",
     ),
 ]  # fmt: skip
-"""Commands before that of the server, and the signals that it gets."""
+"""Commands that precede the server's command, and the signals that the server receives."""
 
 
 @pytest.mark.system

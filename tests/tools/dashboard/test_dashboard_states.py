@@ -1,4 +1,4 @@
-"""Faults that the dashboard's page explains in words: brokers, rights, versions, clocks, rigs."""
+"""Faults that the dashboard's page explains: brokers, permissions, versions, clocks, rigs."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ async def browser() -> AsyncIterator[Browser]:
 async def page_of(
     browser: Browser, server: DashboardServer, query: str = ""
 ) -> AsyncIterator[OpenedPage]:
-    """Yield the page of a server; it may not report errors or leave its origin."""
+    """Yield the page of a server; require that it reports no errors and stays in its origin."""
     async with (
         server.listening(ListenAddress(HOST, 0)) as url,
         opened(browser, url + query) as page,
@@ -47,7 +47,7 @@ async def page_of(
 
 
 async def show_state(page: OpenedPage, name: str) -> None:
-    """Take pictures of a state in both themes on phone and desktop; check accessibility."""
+    """Save screenshots of a state in both themes and two sizes; check accessibility."""
     for size in ("phone", "desktop"):
         width, height = SIZES[size]
         await page.page.set_viewport_size({"width": width, "height": height})

@@ -1,4 +1,4 @@
-"""Each fault of ports, interfaces and host has a finding, and a sound host has none."""
+"""Each fault of ports, interfaces and host yields a finding; a host without faults has none."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TIME_ERROR = 5
 
 
 def gateway(root: Path, **facts: Any) -> Host:
-    """A host whose user may open everything; the root folder is a directory of the test."""
+    """Return a host whose user may open all files; the root is a directory of the test."""
     sound: dict[str, Any] = {
         "run": lambda _: None, "user": "lab", "groups": frozenset({"lab", "dialout"}),
         "may_open": lambda _: True, "group_of": lambda _: "dialout",
@@ -55,7 +55,7 @@ def one(found: Any, level: str) -> Finding:
 
 @pytest.fixture
 def tree(tmp_path: Path) -> Path:
-    """A host with one FTDI adapter that is set up well."""
+    """Return the root of a host with one FTDI adapter that is configured well."""
     add_port(tmp_path, "ttyUSB0", "ftdi_sio", latency_ms=1, by_id=FTDI_LINK)
     return tmp_path
 

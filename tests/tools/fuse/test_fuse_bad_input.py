@@ -1,6 +1,6 @@
-"""What people hand to `jointfit fuse` that is not as it should be: a clear verdict, or a right fit.
+"""Unusual input of `jointfit fuse`: a clear error message, or a right fit.
 
-Every refusal names the thing and the remedy.
+Every error message names the object and the remedy.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def test_a_reference_missing_half_of_the_time_still_teaches(files: Path) -> None
     for segment in ("thigh", "shank"):
         assert found["m2", "anchored"][segment] < 0.7 * found["m2", "mean"][segment]
     frames = rows(run("evaluate", files / "h0.npz", files / "m1.npz", *LIMB, "--json"))
-    assert frames["h0", "mean"]["frames"] == N // 2  # told is what was judged, not what was there
+    assert frames["h0", "mean"]["frames"] == N // 2  # only evaluated frames
 
 
 def test_trial_without_evaluation_frames_is_reported(files: Path) -> None:
@@ -140,7 +140,7 @@ def test_trial_without_reference_is_rejected_with_a_remedy(files: Path) -> None:
 
 
 def test_sensors_and_bones_of_one_name_are_kept_apart(files: Path) -> None:
-    """A file may call both the sensor and the bone ``thigh``: neither stands for the other."""
+    """A file may use the name ``thigh`` for a sensor and for a bone; both are distinguished."""
     trial = movement()
     sensors = {"thigh": trial.sensors["A"], "shank": trial.sensors["C"]}
     rewrite(files, "same", OrientationTrial(trial.t_s, sensors, trial.bones, {}))

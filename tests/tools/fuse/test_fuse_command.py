@@ -1,4 +1,4 @@
-"""`jointfit fuse` on files: what it judges, what it writes, and what it says of wrong files."""
+"""`jointfit fuse` on files: evaluation, output files, and messages about wrong files."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_a_single_trial_is_judged_on_its_end(files: Path) -> None:
 
 
 def test_evaluation_uses_frames_that_were_not_fitted(files: Path) -> None:
-    """A trial whose reference is nonsense spoils its own row and the others' by training only."""
+    """A trial with a wrong reference affects its own row, and others through training only."""
     spoiled = movement(2)
     turned = rotation.multiply(spoiled.bones["thigh"], rotation.exp(np.array((1.0, 0, 0))))
     write_orientations_npz(
@@ -106,7 +106,7 @@ def test_the_semireal_squats_reproduce_their_published_figures(shared_data: Path
 
 @cache
 def model_text(folder: Path, method: str) -> str:
-    """Return the model of the three trials, which are the same in every folder."""
+    """Return the model of the three trials, which are equal in every folder."""
     static = ["--static", folder / "still.npz", "--method", method]
     result = run("fit", *trials(folder), *LIMB, *static, "--out", folder / "fit.json")
     assert result.exit_code == 0, result.output
@@ -120,13 +120,13 @@ def three_trials(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def files(three_trials: Path, tmp_path: Path) -> Path:
-    """Return a folder of one's own with the three movements and the still pose."""
+    """Return a private folder with the three movements and the static pose."""
     return Path(shutil.copytree(three_trials, tmp_path / "files"))
 
 
 @pytest.fixture
 def fitted(three_trials: Path, files: Path) -> Callable[..., Path]:
-    """Return what writes a fitted model beside the trials."""
+    """Return a function that writes a fitted model next to the trials."""
 
     def write(method: str = "anchored") -> Path:
         (files / "model.json").write_text(model_text(three_trials, method))
@@ -208,13 +208,13 @@ def test_missing_sensor_is_reported_and_the_others_are_fused(
 
 @cache
 def figures_of_npz(folder: Path) -> dict[tuple[str, str], Any]:
-    """Return the figures of two trials, which are the same in every folder."""
+    """Return the results of two trials, which are equal in every folder."""
     options = [*LIMB, "--static", folder / "still.npz", "--json"]
     return rows(run("evaluate", *trials(folder, 2), *options))
 
 
 def as_sto(path: Path, trial: OrientationTrial, *, bones: bool, up: str = "z") -> None:
-    """Write sensors, or bones, as OpenSim would."""
+    """Write the orientations of sensors or bones as OpenSim does."""
     columns = trial.bones if bones else trial.sensors
     q = np.stack(list(columns.values()), axis=1)
     q = q[..., [0, 2, 3, 1]] if up == "y" else q
@@ -262,7 +262,7 @@ def test_a_plot_is_written(files: Path) -> None:
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
     static = ["--static", files / "still.npz", "--plot", files / "plot.png"]
     arguments = ["fuse", "evaluate", files / "m0.npz", *LIMB, *static]
-    subprocess.run(  # a process of its own: matplotlib keeps its fonts open
+    subprocess.run(  # in a new process, because matplotlib keeps its fonts open
         [sys.executable, "-m", "jointfit_daemon.tools", *map(str, arguments)],
         check=True,
         timeout=25,

@@ -1,6 +1,6 @@
 """Joint positions and the angles of the patent in the output of `jointfit fuse apply`.
 
-The expected values are computed with scipy rotations and with quaternion products written out here.
+The expected values are computed with SciPy rotations and with explicit quaternion products.
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ def mean_model(lengths: tuple[tuple[str, float], ...] = ()) -> Calibration:
 
 
 def recorded(thigh: Array, shank: Array) -> OrientationRecording:
-    """Return sensors that have the orientations of their segments, 100 Hz."""
+    """Return a recording at 100 Hz of sensors with the orientations of their segments."""
     q = {"A": thigh, "B": thigh, "C": shank, "D": shank}
     return OrientationRecording(np.arange(len(thigh)) / 100.0, q, {})
 
 
 def product(a: Array, b: Array) -> Array:
-    """Return the Hamilton product, written out."""
+    """Return the Hamilton product, computed component by component."""
     (aw, ax, ay, az), (bw, bx, by, bz) = a.T, b.T
     return np.stack(
         (
@@ -72,7 +72,7 @@ def product(a: Array, b: Array) -> Array:
 
 
 def below(origin: Array, q: Array, length: float) -> Array:
-    """Return P + q (0, 0, 0, -L) q*: step S5 of the patent with z from distal to proximal."""
+    """Return P + q (0, 0, 0, -L) q* (step S5 of the patent), z from distal to proximal."""
     along = np.tile((0.0, 0.0, 0.0, -length), (len(q), 1))
     return origin + product(product(q, along), q * (1.0, -1.0, -1.0, -1.0))[:, 1:]
 
@@ -224,7 +224,7 @@ def test_no_position_is_written_without_the_first_length(files: Path, tmp_path: 
 
 
 def write_gap(path: Path, shank: slice, thigh: slice) -> Path:
-    """Write the trial without the sensors of each segment in some frames."""
+    """Write the trial with missing sensors of each segment in some frames."""
     trial = movement(1)
     for name in "ABCD":
         trial.sensors[name][thigh if name in "AB" else shank] = np.nan
@@ -238,7 +238,7 @@ def test_frames_with_unknown_values_are_left_out_of_opensim_files(
 ) -> None:
     opensim = pytest.importorskip("opensim", reason="opensim is not installed")
     opensim.Logger.setLevelString("off")
-    # the fusion holds an orientation for 10 frames, 0.2 s
+    # The fusion repeats an orientation for 10 frames (0.2 s).
     gap = write_gap(tmp_path / "gap.npz", np.s_[50:80], np.s_[60:90])
     out = tmp_path / f"r.{ending}"
     result = run("apply", files / "model.json", gap, "--out", out, *LENGTHS)
@@ -333,7 +333,7 @@ def test_an_edited_calibration_is_rejected(files: Path, tmp_path: Path) -> None:
 
 
 def fit(folder: Path, *options: object) -> dict[str, Any]:
-    """Fit the mean to a trial; return the segments of the model."""
+    """Fit the method ``mean`` to a trial; return the segments of the model."""
     out = folder / "fitted.json"
     result = run("fit", folder / "t.npz", *LIMB, "--method", "mean", "--out", out, *options)
     assert result.exit_code == 0, result.output

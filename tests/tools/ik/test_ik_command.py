@@ -1,4 +1,4 @@
-"""`jointfit ik` as a user runs it."""
+"""The command `jointfit ik` as a user runs it."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def truth() -> Array:
 
 
 def write_trial(folder: Path, change: Any = None, name: str = "walk.trc") -> Path:
-    """Write the markers of the movement, y up, after `change` of positions (T, M, 3)."""
+    """Write the markers of the movement, y up; `change` modifies the positions (T, M, 3)."""
     read = read_osim(folder / "leg.osim")
     y = from_z_up(marker_positions(read.model, state_of(read.model, read.coordinates, truth())))
     y = y if change is None else change(y)
@@ -100,7 +100,7 @@ def fault(words: list[str]) -> tuple[int, str]:
 
 
 def units(values: Array) -> Array:
-    """Return rad as degrees, and translations in metres."""
+    """Return coordinates with angles in degrees and translations in metres."""
     angle = np.array([name not in "xyz" for name in NAMES])
     return np.where(angle, np.degrees(values), values)
 

@@ -37,14 +37,14 @@ if TYPE_CHECKING:
 FOUND = st.sampled_from([NOTHING, DEVICES, STREAM])
 RANDOM = settings(
     max_examples=5,
-    phases=[Phase.explicit, Phase.reuse, Phase.generate],  # to shrink a dialogue takes minutes
+    phases=[Phase.explicit, Phase.reuse, Phase.generate],  # shrinking a dialogue takes minutes
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 
 
 def rig_of(answers: Answers, found: Found) -> Rig:
-    """Return the rig as `jointfit check` reads its text."""
+    """Return the rig that `jointfit check` reads from the text."""
     return parse_rig(tomllib.loads(rig_text(rig_table(answers, found))))
 
 
@@ -56,7 +56,7 @@ def random_answers(data: st.DataObject, found: Found) -> Answers:
 
 
 def assert_means(rig: Rig, answers: Answers) -> None:
-    """Assert that a rig has the meaning of the answers, key by key."""
+    """Assert that each key of a rig corresponds to the answers."""
     limb = LIMBS[answers["limb", ""]]
     assert rig.name == answers["name", ""]
     assert rig.output_rate_hz == answers["output_rate_hz", ""]
@@ -121,7 +121,7 @@ UNUSUAL = {
     "plate": "Board", "length_m": "0.37", "broker": "lab-pc:1884", "ca": "lab.pem",
     "username": "gw", "password_file": "pw",
 }  # fmt: skip
-"""An answer to every question that differs from its proposal."""
+"""An answer to every question, different from its proposal."""
 
 
 @pytest.mark.parametrize("cameras", ["yes", "no"])
@@ -138,7 +138,7 @@ UNUSUAL = {
 def test_every_answer_that_differs_from_its_proposal_is_in_the_rig(
     monkeypatch: pytest.MonkeyPatch, limb: str, encryption: str, cameras: str
 ) -> None:
-    monkeypatch.setattr(_engine, "rig_faults", lambda *_: set())  # the complete rig is checked
+    monkeypatch.setattr(_engine, "rig_faults", lambda *_: set())  # the test checks the complete rig
     chosen = UNUSUAL | {"limb": limb, "encryption": encryption, "cameras": cameras}
     answers: Answers = {}
     while (asked := next_question(answers, NOTHING)) is not None:
@@ -160,7 +160,7 @@ def test_every_answer_that_differs_from_its_proposal_is_in_the_rig(
 
 
 class _Given:
-    """Answers of a file, and those that the user types for the other questions."""
+    """Answers from a file, and typed answers to the other questions."""
 
     def __init__(self, stored: Answers, typed: Answers) -> None:
         self._answers = {**typed, **stored}
@@ -175,7 +175,7 @@ def test_a_dialogue_interrupted_at_any_question_resumes_to_the_same_rig(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, data: st.DataObject, found: Found
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(_engine, "rig_faults", lambda *_: set())  # checked by the tests above
+        patch.setattr(_engine, "rig_faults", lambda *_: set())  # the tests above check it
         whole = random_answers(data, found)
         text = rig_text(rig_table(whole, found))
         state = tmp_path / "rig.answers.toml"

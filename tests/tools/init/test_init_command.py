@@ -32,7 +32,7 @@ LEG = FoundServer(
 
 @dataclass
 class Machine:
-    """The devices of a machine, which a test changes."""
+    """The devices of a machine, which a test can change."""
 
     ports: list[str] = field(default_factory=list)
     servers: list[FoundServer] = field(default_factory=list)
@@ -73,7 +73,8 @@ shank-front = "/dev/ttyUSB2"
 shank-side = "/dev/ttyUSB3"
 """
 TYPED = ["膝-1", "", "left", "", "", "", "a", "b", "", "1", "", "1", "", "", "", "", "", ""]
-"""Lines of a whole dialogue with two sensors and no cameras; empty lines take the proposals."""
+"""Lines of a whole dialogue with two sensors and without cameras; an empty line accepts the
+proposal."""
 
 
 def test_a_typed_dialogue_writes_a_rig_that_check_accepts(tmp_path: Path, machine: Machine) -> None:
@@ -88,7 +89,7 @@ def test_a_typed_dialogue_writes_a_rig_that_check_accepts(tmp_path: Path, machin
         ("b", "/dev/ttyUSB1"),
     ]
     assert f"jointfitd --config {tmp_path / 'lab/rig.toml'}" in done.output
-    assert "jointfit dashboard  " in done.output  # the usual broker needs no option
+    assert "jointfit dashboard  " in done.output  # no option for the usual broker
     assert [path.name for path in (tmp_path / "lab").iterdir()] == ["rig.toml"]
     checked = CliRunner().invoke(app, ["check", str(tmp_path / "lab/rig.toml")])
     assert checked.exit_code == 0
@@ -109,7 +110,8 @@ def test_enter_at_every_question_leaves_open_places_that_check_explains_and_init
     assert checked.output.count("not filled in yet: connect the sensor") == 4
     assert "4 faults" in checked.output
 
-    # Later, only the open places are asked: two of them, the others remain open.
+    # The next run asks for the postponed answers only. Two of them are answered, and the others
+    # remain.
     machine.ports = [f"/dev/ttyUSB{k}" for k in range(4)]
     done = init(tmp_path, "--force", lines=["1", "", "later", "1", "", ""])
     assert done.exit_code == 0, done.output
@@ -184,14 +186,14 @@ def test_identifiers_and_names_that_are_unknown_are_filled_in_later(tmp_path: Pa
     assert json.loads(done.stdout)["open"] == OPEN
     assert f'ids = "{LATER}"' in rig.read_text()
 
-    # Every open place is one fault with its remedy, and the only one.
+    # Every postponed answer is one fault with its remedy, and there are no others.
     for command in (["check"], ["doctor", "--config"]):
         checked = CliRunner().invoke(app, [*command, str(rig)])
         assert checked.exit_code == 2
         assert checked.output.count("not filled in yet: enter the") == len(OPEN)
         assert "5 faults" in checked.output
 
-    # The open places alone are asked, some of them a second time.
+    # The dialogue asks for the postponed answers only, some of them a second time.
     identifiers = ["0x105 0x106 0x121", "later"]
     markers = ["T1, T2, T3", "S1, S2, S3"]
     assert init(tmp_path, "--force", lines=[*identifiers, *markers, "Plate"]).exit_code == 0

@@ -1,4 +1,4 @@
-"""Families whose tables need keys that no default has: choices, and layouts in a file."""
+"""Device families whose tables require keys without defaults: choices, and layouts."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ CAN_LAYOUT = "ids = { quaternion = 0x131 }\n[fields]\nquaternion = { offset = 0,
 
 
 def dialogue(*, devices: Iterable[str] = ()) -> Dialogue:
-    """Return a dialogue about a rig of one sensor S1 and S2, up to their connections."""
+    """Return a dialogue about a rig with the sensors S1 and S2, up to their connections."""
     notes: list[str] = []
     search = DeviceSearch(notes.append, network=False)
     found = Dialogue(search, notes.append, lambda _: "", lambda _: None, drivers_found())

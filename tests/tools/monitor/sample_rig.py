@@ -1,4 +1,4 @@
-"""Messages of a rig that walks, at fixed instants: every payload fits its model."""
+"""Messages of a walking subject's rig at fixed times; every payload matches its model."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ BASE = "jointfit/bench-1"
 START_US = 1_795_250_060_000_000
 """UNIX time of the first pose: 2026-11-21 08:34:20 UTC."""
 START_S = 5_000.0
-"""Monotonic time of the first pose."""
+"""Monotonic time of the first pose, s."""
 PERIOD_S = 0.1
 THIGH_M, SHANK_M = 0.43, 0.39
 STEP_S = 1.2
@@ -46,7 +46,7 @@ class SampleRig:
     cameras: bool = True
     recording: dict[str, Any] = field(default_factory=lambda: dict(RECORDING))
     clock_offset_s: float = 0.0
-    """Clock of the gateway minus that of the terminal, s."""
+    """Clock of the gateway minus clock of the terminal, s."""
 
     def t_us(self, seconds: float) -> int:
         return START_US + round(1e6 * (seconds + self.clock_offset_s))
@@ -239,7 +239,7 @@ def connected_state(**options: Any) -> MonitorState:
 
 
 def take(state: MonitorState, topic: str, payload: Any, seconds: float = 0.0) -> None:
-    """Pass a message that fits its model to the state."""
+    """Pass a valid message to the state."""
     model = payload_topic(topic)
     assert model is not None, topic
     PAYLOADS[model].model_validate(payload)

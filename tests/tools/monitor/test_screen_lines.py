@@ -1,4 +1,4 @@
-"""The screen in words: every state at every size, in any script, with and without Unicode."""
+"""The screen as text: every state at every size, in any script, with and without Unicode."""
 
 from __future__ import annotations
 
