@@ -3,7 +3,7 @@ r"""Joint angles from the rotation between two segments.
 .. math:: q_j = q_{proximal}^* \otimes q_{distal}
 
 R is the matrix of this quaternion; its indices start at 0. CONVENTIONS.md defines segment axes (x
-to the right, y anterior, z proximal) and signs. Angles are in rad; q and -q give the same result.
+to the right, y anterior, z proximal) and signs. Angles are in rad. q and -q have the same angles.
 `AngleConvention` selects the three angles of a joint. If two axes of a sequence coincide, the two
 angles are not unique. One angle is then set to 0, the other contains the whole rotation, and the
 frame is flagged as gimbal-locked.
@@ -74,7 +74,7 @@ def functional_axis(q_joint: ArrayLike) -> Array:
 
 
 class JointReading(NamedTuple):
-    """The angles of one joint in one frame."""
+    """Angles of one joint in one frame."""
 
     angles: JointAngles
     inner: float

@@ -106,8 +106,8 @@ def exp(r: ArrayLike) -> Array:
 def log(q: ArrayLike) -> Array:
     """Return the shortest rotation vector of unit quaternions, rad, shape (..., 4) to (..., 3).
 
-    The length of the vector is at most pi; q and -q give the same vector. The angle is computed by
-    atan2, because acos loses all digits near the identity.
+    The length of the vector is at most pi, and q and -q have the same vector. The angle is computed
+    by atan2, because acos loses all digits near the identity.
     """
     q = _floats(q)
     q = np.where(q[..., :1] < 0.0, -q, q)
@@ -141,8 +141,8 @@ def to_matrix(q: ArrayLike) -> Array:
 def from_matrix(R: ArrayLike) -> Array:
     """Return unit quaternions with w >= 0, shape (..., 4), of rotation matrices, shape (..., 3, 3).
 
-    The largest of the four components is computed by a square root. The other components follow by
-    division, which is accurate at all angles. Source: Shepperd 1978.
+    The largest of the four components is computed by a square root. The other components are
+    computed by division. The method is accurate at all angles. Source: Shepperd 1978.
     """
     R = _floats(R)
     trace = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2]

@@ -28,7 +28,7 @@ LARGEST = 0.4
 
 @dataclass(frozen=True, slots=True)
 class KernelExpert:
-    """A fitted correction of one segment."""
+    """Fitted correction of one segment."""
 
     width: float
     """Kernel width, rad; one of ``WIDTHS``."""

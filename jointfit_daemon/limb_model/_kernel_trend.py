@@ -26,7 +26,7 @@ LEVEL_AXES = (0, 1)
 
 
 def trend(rows: tuple[Row, Row], u: Array) -> Array:
-    """Return T of every frame, rad, shape (n, 3), with each component limited like a correction."""
+    """Return the trend of every frame, rad, (n, 3), with the limits of a correction."""
     found = np.zeros((len(u), 3))
     table = np.array(rows)
     found[:, LEVEL_AXES] = table[:, 0] + u @ table[:, 1:].T

@@ -301,7 +301,7 @@ class LabelSearch:
         return tuple(self._groups(place_of, elsewhere))
 
     def _assignments(self, p: int, frame: _Frame, pool: Rows, rms: float) -> list[_Assignment]:
-        """Return the best assignments of one cluster, with its own labels first.
+        """Return the best assignments of one cluster, with the unchanged labels first.
 
         Labels are added marker by marker. An assignment is dropped if the distance of two markers
         differs from their distance in the cluster.
@@ -409,7 +409,7 @@ def explain_trial(search: LabelSearch, positions: Array) -> tuple[LabelFault, ..
     search : LabelSearch
         The clusters.
     positions : ndarray, shape (m, M, 3)
-        Markers in the order of its labels, m; NaN if hidden.
+        Marker positions in the order of the labels of `search`, m; NaN if hidden.
     """
     rows = np.unique(np.linspace(0, len(positions) - 1, _SAMPLED).astype(int))
     findings = [search.explain(positions[row]) for row in rows if len(positions)]

@@ -32,12 +32,12 @@ class MarkerCluster:
     origin: Array
     """Centroid of the markers or origin of the rigid body, static world, m, shape (3,)."""
     q_body: Array
-    """q_static-world_body of the rigid body; the identity for markers."""
+    """Rotation from the rigid body to the static world; the identity for markers."""
 
 
 @dataclass(frozen=True, slots=True)
 class StoredCluster:
-    """A `MarkerCluster` as plain data in a calibration."""
+    """Plain data of a `MarkerCluster` in a calibration."""
 
     markers: tuple[str, ...]
     body: str | None

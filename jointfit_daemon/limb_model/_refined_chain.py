@@ -59,5 +59,5 @@ def chain_fingerprint(model: ChainModel) -> str:
 
 
 def _rounded(*rows: tuple[float, ...]) -> list[float]:
-    """Return all numbers, rounded, in one list; 0 instead of -0."""
+    """Return all numbers, rounded, in one list, with 0 instead of -0."""
     return [float(value) for row in rows for value in np.round(row, _DIGITS) + 0.0]

@@ -44,7 +44,7 @@ class Prediction(NamedTuple):
     extrapolating: bool
     """Whether the posture is outside the training range."""
     axis_sd: Vector | None = None
-    """Standard deviations about x, y and z of the segment, rad; None if not known separately."""
+    """Standard deviations about x, y and z of the segment, rad; None if unknown."""
 
 
 class SegmentModel(ABC):

@@ -72,7 +72,7 @@ def fuse_one(sensors: Sequence[Quaternion], weights: Sequence[float]) -> Quatern
     (pw, px, py, pz), (qw, qx, qy, qz) = sensors
     w1, w2 = weights
     d = pw * qw + px * qx + py * qy + pz * qz
-    if w1 == w2:  # in this case a = b
+    if w1 == w2:  # then a = b
         if d < 0.0:
             return normalize_one((pw - qw, px - qx, py - qy, pz - qz))
         return normalize_one((pw + qw, px + qx, py + qy, pz + qz))

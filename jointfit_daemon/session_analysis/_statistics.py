@@ -56,7 +56,7 @@ class MotionRange:
 
 
 def motion_range(joint: JointSeries, angle: str) -> MotionRange | None:
-    """Return the range of an angle; None if it is known at no instant."""
+    """Return the range of an angle; None if the angle is unknown at all instants."""
     values = joint.angles[angle]
     known = np.isfinite(values)
     if not known.any():

@@ -31,7 +31,7 @@ class SessionData:
 
     name: str
     start_unix_ns: int | None = None
-    """UNIX time of ``t_s`` = 0, ns; None if unknown, as in most motion-capture files."""
+    """UNIX time at ``t_s`` = 0, ns. It is None if unknown, as in most motion-capture files."""
     sensors: tuple[SensorSeries, ...] = ()
     markers: MarkerSeries | None = None
     segments: tuple[SegmentSeries, ...] = ()

@@ -164,7 +164,7 @@ def equal_step_error(step: ArrayLike, noise: ArrayLike) -> Array:
     Returns
     -------
     ndarray, shape (...)
-        RMS distance from the true center, m; inf at 0 and π.
+        RMS distance from the true center, m; inf for the steps 0 and π.
     """
     a = np.asarray(step, dtype=np.float64)
     one_less = 2.0 * np.sin(a / 2) ** 2

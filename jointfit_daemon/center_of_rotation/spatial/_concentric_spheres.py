@@ -83,7 +83,7 @@ class ConcentricSpheres:
     center: Array
     """Common center, m, shape (r,)."""
     noise2: float
-    """Unbiased variance of a coordinate of a marker whose relative noise is one, m²."""
+    """Unbiased variance of a coordinate of a marker with the relative noise 1, m²."""
     relative: Array
     """Noise variance of each marker divided by the common variance, shape (k,)."""
     radii2: Array

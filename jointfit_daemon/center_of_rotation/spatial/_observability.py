@@ -111,7 +111,7 @@ def moving_directions(paths: MarkerPaths) -> Array:
 def observe(
     sums: SphereSums, paths: MarkerPaths, basis: Array, limits: SphereLimits
 ) -> ObservedCenter | None:
-    """Fit the center, dropping the least observable direction until all others are observable.
+    """Fit the center, and drop the least observable direction until all others are observable.
 
     The fit omits directions that noise dominates. It includes directions that only soft-tissue
     artefact excites, because the residuals would be larger without these directions. The result
@@ -246,7 +246,7 @@ def _spread(
 
 
 def _no_better(spread: Array, white: Array) -> Array:
-    """Return `spread`, raised in every direction to a quarter of the white-noise covariance.
+    """Return `spread`, which is increased to at least a quarter of the white-noise covariance.
 
     With few frames, chance correlations between markers could cancel all noise.
     """

@@ -39,7 +39,9 @@ OFF = 8.0
 """
 OFF_M = 0.01
 STAYED_OFF = 25
-"""Consecutive frames off its sphere after which a marker is restarted at its new position."""
+"""Number of consecutive frames off its sphere after which a marker is restarted at its new
+position.
+"""
 _FAR_M = 2.0
 """Largest distance of a marker from its fixed point, m, because fourth powers of larger distances
 lose digits.
@@ -64,7 +66,7 @@ class _ExpectedMarkers:
 
 
 class RunningSphere:
-    """Center of rotation of several markers, fed frame by frame.
+    """Center of rotation of several markers, which processes frame by frame.
 
     Parameters
     ----------

@@ -155,14 +155,15 @@ def two_sided_estimate(
         noise = ClusterNoise.of(markers[0]), ClusterNoise.of(markers[1])
         fit = fit_two_sides(poses, noise, c, Vt[:rank].T, robust=robust)
 
-    # Arc of the direction that rotated most; the resultant is the length of the mean direction.
+    # The arc is that of the direction that rotated most. The resultant is the length of the mean
+    # direction.
     R = rotation.to_matrix(rotation.multiply(rotation.conjugate(poses[0].q), poses[1].q))
     arc = arc_of(float(np.linalg.svd(R.mean(axis=0))[1][2]))
     found = _answer(name, fit, Vt, arc, near, posture=posture)
     if markers is None or not np.isfinite(found.center).all():
         return found
 
-    # Distances of the markers from the center, m; for a hinge, distances from the axis (rows).
+    # Distances of the markers from the center or, for a hinge, from the axis, m.
     away = markers[1] - fit.point[3:]
     axis = Vt[len(fit.score) :, 3:]
     along = axis / np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-300)

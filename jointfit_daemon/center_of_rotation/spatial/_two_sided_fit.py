@@ -75,8 +75,9 @@ class TwoSidedFit:
     score: Array
     """Variance of the estimating equations for unit noise, along the basis, shape (r, r)."""
     information: Array
-    """Derivative of the estimating equations, shape (r, r). Without noise in the rotations it is
-    the inverse covariance."""
+    """Derivative of the estimating equations, shape (r, r). Without noise in the rotations this
+    derivative is the inverse covariance.
+    """
 
     def spread(self) -> Array | None:
         r"""Return the covariance along the basis per noise variance, :math:`M^{-1} S M^{-1}`.
@@ -176,7 +177,7 @@ class _LinearGaps:
     V: Array
     """Inverse covariance of the gap for unit noise, (n, 3, 3)."""
     A: Array
-    """Derivative of the gap by the point, (n, 3, 6)."""
+    """Derivative of the gap with respect to the point, (n, 3, 6)."""
     gap: Array
     """Gap before the correction of the rotations, m, (n, 3)."""
 
@@ -227,9 +228,9 @@ def _remaining_noise(
               δA = (E_1 [δφ_1]_×, \; -E_2 [δφ_2]_×), \qquad
               \mathrm{Cov}(δφ) = \mathrm{diag}(G_i^{-1}) - K V K^T
 
-    per noise variance. A is the derivative of the gap by the point, V the inverse covariance of the
-    gap, and w the weight of frame t. Cov(δφ) is the covariance of the rotations after the
-    correction by the gap.
+    per noise variance. A is the derivative of the gap with respect to the point, V the inverse
+    covariance of the gap, and w the weight of frame t. Cov(δφ) is the covariance of the rotations
+    after the correction by the gap.
     """
     out = np.zeros((6, 6))
     for i in (0, 1):

@@ -1,7 +1,7 @@
 r"""Monte Carlo study of the circle fits: maps of the error over arc, noise and radius.
 
-Invariant: one seeded generator supplies all random numbers. All runs of a cell are computed
-at once.
+Invariant: one seeded generator supplies all random numbers. All runs of a cell are computed in one
+call.
 
 A marker at distance r from the center is at the angles 0, α and 2α; each coordinate has independent
 noise of standard deviation σ. In each map, two of the quantities r, σ and α vary, and the third is

@@ -42,7 +42,7 @@ _TOGETHER = 4096
 cache.
 """
 OPEN_M2 = 4e-4
-"""Information, m^2/rad^2, below which a degree of freedom is undetermined: (2 cm)²."""
+"""Information, m^2/rad^2, below which a degree of freedom is undetermined. It is (2 cm)²."""
 
 
 @dataclass(frozen=True, slots=True)

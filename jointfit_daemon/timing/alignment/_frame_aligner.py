@@ -45,7 +45,7 @@ class AlignedFrame(NamedTuple):
 
     t_ns: int
     completed_ns: int
-    """Arrival of the sample that completed the frame, or its deadline, ns."""
+    """Arrival of the sample that completed the frame, or the deadline of the frame, ns."""
     orientations: Mapping[str, Quaternion]
     """Orientation of every stream that is not missing, in the order of the streams."""
     extrapolated: frozenset[str]
@@ -100,9 +100,9 @@ class FrameAligner:
         self._serves_ns: int | None = None  # first instant with data of a stream
         self._completed_ns = 0
         self._synced = False
-        """Whether the clocks behind the last frame had settled."""
+        """Whether the clocks of the last frame had settled."""
         self._deadline_ns: int | None = None
-        self._changed = True  # change since the last computation of `_deadline_ns`
+        self._changed = True  # whether `_deadline_ns` must be computed again
         self._dues: dict[str, int] = {}
         """Host time at which each stream is ready for the next frame, ns; empty until first
         computed.
@@ -123,7 +123,7 @@ class FrameAligner:
         epoch: int = 0,
         rate: Vector | None = None,
     ) -> SampleOutcome | None:
-        """Add a sample; return its outcome if it is already known.
+        """Add a sample; return the outcome of the sample if the outcome is already known.
 
         Parameters
         ----------
@@ -169,7 +169,7 @@ class FrameAligner:
 
     @property
     def next_ns(self) -> int | None:
-        """Instant of the next frame, ns; None before the first."""
+        """Instant of the next frame, ns; None before the first frame."""
         return None if self._next is None else self._next * self._period_ns
 
     def advance(self, now_ns: int, *, complete_only: bool = False) -> list[AlignedFrame]:

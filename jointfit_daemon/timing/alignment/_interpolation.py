@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _NS = 1e-9
 CURVATURE_SHARE = 0.5
-"""Fraction of the measured curvature used in extrapolation; see docs/timing.md."""
+"""Fraction of the measured curvature that an extrapolation uses (docs/timing.md)."""
 _CONTRADICTS = 0.25
 """Largest accepted relative difference between a rotation and the integral of the measured rates.
 """
@@ -115,7 +115,7 @@ def extrapolate_orientation(
         if earlier is not None:
             h1 = (before.t_ns - earlier.t_ns) * _NS
             first = difference_one(a.q, earlier.q)
-            # In the tangent space of `a`: `earlier` at `first`, `before` at -turn, `a` at 0.
+            # In the tangent space of `a`, `earlier` is at `first`, `before` at -turn, and `a` at 0.
             weight = bend * (x_c * (x_c + h0) + (2.0 * x_c + h0) * (x - x_c)) / (h0 + h1)
             bent = _combine(weight * (1.0 / h0 + 1.0 / h1), turn, weight / h1, first)
             r = (r[0] + bent[0], r[1] + bent[1], r[2] + bent[2])

@@ -105,7 +105,7 @@ class Stream:
         self._delay_ns: int | None = None  # usual arrival time minus timestamp
         self._samples: deque[_Sample] = deque()
         self.epoch: int | None = None
-        """Epoch of the clock behind the samples."""
+        """Epoch of the clock of the samples."""
         self.waited_for = False
         """Whether more samples are expected."""
         self._received = 0
@@ -193,7 +193,7 @@ class Stream:
         return t_ns if before is not None and t_ns - before.t_ns <= self._reach_ns else None
 
     def due(self, t_ns: int) -> int:
-        """Return the arrival of the first sample at or after `t_ns`, or its deadline, ns."""
+        """Return the arrival of the first sample at or after `t_ns`, or the deadline, ns."""
         if not self.waited_for:
             return t_ns  # no frame is published before its instant
         newest = self.newest_ns

@@ -60,7 +60,7 @@ def early_arrival_event(early_ns: float) -> ClockEvent:
 
 
 def late_arrival_event(late_ns: float, seconds: float) -> ClockEvent:
-    """Return the event for samples that stay late for `seconds`."""
+    """Return the event for samples that have been late for `seconds`."""
     text = (
         f"samples have arrived {late_ns / _MS:.1f} ms late for {seconds:g} s: the device clock "
         "stopped for that time"

@@ -13,7 +13,7 @@ HALF_NS = 30_000_000_000
 """Length of one histogram, ns."""
 
 _UNIT_BITS = 10
-"""Finest step: 2**10 ns, about a microsecond."""
+"""Binary logarithm of the finest step, which is 2**10 ns, about a microsecond."""
 _SUB_BITS = 3
 """Binary logarithm of the number of bins per octave: eight bins."""
 _SUBS = 1 << _SUB_BITS
