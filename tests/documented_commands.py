@@ -1,7 +1,7 @@
 """The commands that a page prints, and a shell that runs them as printed.
 
-A fence ```` ```sh ```` holds commands. A fence ```` ```text ```` directly below it holds what they
-print: lines of stdout in their order, ``…`` for lines left out, numbers within 2 %. A TOML fence
+A fence ```` ```sh ```` contains commands. A fence ```` ```text ```` directly below it contains
+their output: lines of stdout in order, ``…`` for omitted lines, numbers within 2 %. A TOML fence
 whose first line is ``# NAME.toml`` is the file of that name.
 """
 
@@ -27,17 +27,17 @@ COMMENT = re.compile(r"(?:^|\s+)# .*$")
 PLACEHOLDER = re.compile(r"…|\.\.\.|<[a-z][a-z-]*>|\b(?:DIR|FILE|NAME|PATH|RUN|SERIAL|TRIAL)\b")
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
 LEAST_AGREEMENT = 0.02
-"""Numbers of an output may differ by this share (other processors round differently), or by two
-units of the last digit printed, whichever is more."""
+"""Largest accepted relative difference of a printed number, because other processors round
+differently. Two units of the last printed digit are also accepted."""
 COMMAND_S = 240.0
-"""Longest time of one command; on a quiet machine none takes a tenth of it."""
+"""Time limit of one command, s. On an idle machine, no command needs a tenth of it."""
 
 SERVICES = re.compile(r"jointfitd --config|jointfit-sim play|mosquitto_sub")
 """Commands that run until they are stopped."""
 READY = {"jointfitd": "connected to", "jointfit-sim": '"ready":true'}
-"""What a service has printed once it can be used; others are ready at once."""
+"""Text that a service prints when it is ready, by service. Other services are ready at once."""
 OPTIONAL_PROGRAMS = ("mosquitto_sub", "mosquitto_pub", "openssl")
-"""Programs whose commands run only where they are installed."""
+"""Programs whose commands run only if the programs are installed."""
 
 NOT_RUN = {
     r"^(sudo|sudoedit|systemctl|journalctl) |apt ": "needs root and systemd: tests/vm_service",
@@ -67,7 +67,7 @@ NOT_RUN = {
 
 
 class Block(NamedTuple):
-    """One fence of commands and what the page says that it prints."""
+    """One fence of commands, with their output on the page."""
 
     commands: tuple[str, ...]
     output: str | None
@@ -93,7 +93,7 @@ def page_parts(text: str) -> Iterator[Block | PageFile]:
 
 
 def uncommanded(text: str) -> list[str]:
-    """Return the fences of a page that hold no language, or an output."""
+    """Return the fences of a page without a language, and outputs without commands."""
     return [fence[3] for fence in FENCE.finditer(text) if fence[2] in {"", "text"}]
 
 
@@ -118,7 +118,7 @@ def reason_not_to_run(command: str) -> str | None:
 
 
 def disagreement(expected: str, printed: str) -> str | None:
-    """Return the first expected line that was not printed, in order; None if all were."""
+    """Return the first expected line that is missing in the output; None if none is missing."""
     lines = [line.split() for line in printed.splitlines() if line.strip()]
     place, anywhere = 0, False
     for line in filter(str.strip, expected.splitlines()):
@@ -154,7 +154,7 @@ def _near(expected: str, printed: str) -> bool:
 
 @dataclass
 class Shell:
-    """One bash session, as a reader of a page has it; services run beside it until the end."""
+    """A bash session, as a reader of a page uses it; services run until the end."""
 
     folder: Path
     environment: Mapping[str, str]
@@ -181,25 +181,25 @@ class Shell:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Kill what is left, and bash."""
+        """Kill the remaining services and bash."""
         for _, pid, _ in self._services:
             self._ask(f"kill -KILL {pid}; echo")
         self._process.communicate(timeout=COMMAND_S)
 
     def run(self, command: str) -> str:
-        """Run a command, or start a service, and return what it printed on stdout."""
+        """Run a command or start a service; return its output on stdout."""
         if SERVICES.match(command):
             self._start(command.removesuffix("&").strip())
             return ""
         out, err = self._files()
-        # who is asked for Enter gets it
+        # A prompt for the Enter key receives it.
         code = self._ask(f"{{ {command}\n}} >{out} 2>{err} < <(yes '')\necho $?")
         said = out.read_text("utf-8", "replace")
         assert code == "0", f"{command}\nexit code {code}\n{said}{err.read_text()}"
         return said
 
     def stop_services(self) -> None:
-        """End the services, the last one first; each must end as asked."""
+        """Stop the services in reverse order; each must stop on request."""
         while self._services:
             command, pid, err = self._services.pop()
             code = self._ask(f"kill -TERM {pid}; wait {pid}; echo $?")
@@ -224,7 +224,7 @@ class Shell:
         return files
 
     def _ask(self, script: str) -> str:
-        """Give bash a script that prints one line; return the line."""
+        """Send bash a script that prints one line; return the line."""
         stdin, stdout = self._process.stdin, self._process.stdout
         assert stdin is not None
         assert stdout is not None

@@ -1,6 +1,7 @@
-"""A leg of known geometry for tests, written with SciPy only: an oracle shares no code with us.
+"""A leg of known geometry for tests, written with SciPy only and without code of the project.
 
-Segment frames as in CONVENTIONS.md: x right, y forward, z up, origin at the proximal joint center.
+Segment frames are those of CONVENTIONS.md: x right, y forward, z up, origin at the proximal joint
+center.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ SETTINGS = CalibrationSettings(markers=MARKERS, plate="Plate")
 
 @dataclass(frozen=True)
 class Imperfections:
-    """What is wrong with sensors and markers."""
+    """Errors of sensors and markers."""
 
     marker_m: float = 0.0005
     skin_m: float = 0.0
@@ -56,7 +57,10 @@ class Imperfections:
 
 @dataclass(frozen=True)
 class Subject:
-    """One wearer in one room: mounts, worlds, facing, skin; the same for all trials."""
+    """One subject with alignments, sensor worlds, facing direction and soft tissue.
+
+    All trials of a subject have the same values.
+    """
 
     seed: int = 0
     facing: float = 0.7
@@ -88,7 +92,7 @@ class Motion:
 
 
 def motion(subject: Subject, seconds: float, rate_hz: float, *, still: bool = False) -> Motion:
-    """Walking, squats and hip circles one after another, beginning and ending in standing."""
+    """Return walking, squats and hip circles one after another, with standing at both ends."""
     t = np.arange(round(seconds * rate_hz)) / rate_hz
     calm = 0.0 if still else 1.0
     hip, adduction, turn, knee, ankle, sway = calm * _program(t, seconds)

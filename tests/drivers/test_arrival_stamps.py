@@ -1,4 +1,4 @@
-"""Arrival stamps: what wall clocks, chunking and adapters do to the bytes, they do not to time."""
+"""Arrival stamps do not depend on steps of the wall clock, chunk sizes and adapters."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ EPOCH = 1_000 * S
 
 
 class ArrivalHost:
-    """Two clocks; every reading takes 40 ns. The wall clock is stepped at an instant."""
+    """Two clocks; a reading takes 40 ns. The wall clock is stepped at a given time."""
 
     def __init__(self, step_at_ns: int, step_ns: int) -> None:
         self.now, self._step_at, self._step = EPOCH, step_at_ns, step_ns
@@ -87,7 +87,7 @@ def test_a_wall_clock_stepped_by_an_hour_in_a_burst_moves_no_arrival(
 
 
 def test_arrivals_after_an_hour_of_suspend_are_a_step() -> None:
-    """While a host is suspended CLOCK_MONOTONIC stands still and the wall clock goes on."""
+    """During suspend, CLOCK_MONOTONIC stops and the wall clock continues."""
     host = ArrivalHost(EPOCH + 5_000_000, HOUR)
     arrivals = [EPOCH + k * 1_000_000 for k in range(1, 10)]
     assert received(host, arrivals, [EPOCH + 20_000_000]) == pytest.approx(arrivals, abs=1_000)
@@ -195,7 +195,7 @@ def test_frames_of_one_read_from_usb_lie_one_behind_the_other_on_the_bus() -> No
 
 
 def test_configured_baud_rate_does_not_delay_stamps_of_a_usb_adapter() -> None:
-    """At 115 200 baud, as configured, the group below would have taken 4 ms."""
+    """At the configured 115 200 baud, the group below would need 4 ms."""
     wire = b"".join(encode_frame(frame) for frame in GROUP)
     slow = SlcanCodec(BAUD).feed(wire, EPOCH)[0]
     usb = SlcanCodec(None).feed(wire, EPOCH)[0]

@@ -1,4 +1,4 @@
-"""Devices that are newer than known: named with version and remedy, and used as far as known."""
+"""Devices with newer firmware: a warning with version and remedy, and use of known parts."""
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ class Newer(NamedTuple):
     driver: str
     make: Callable[[Path, WireNoise], Any]
     unknown: bytes
-    """Message of unknown content, which follows each of the device's own."""
+    """Message of unknown content, which follows each message of the device."""
     named: str
-    """Its name in the warning."""
+    """Name of the unknown message in the warning."""
     version: str | None
     """Version that the device reports; None for a family without one."""
     keys: Any = {}  # noqa: RUF012 - never changed

@@ -1,4 +1,4 @@
-"""Damaged files of every kind: a reader answers or raises its own error, in bounded memory."""
+"""Damaged files of every type: a reader returns or raises its own error, in bounded memory."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 MOST_BYTES = 64 << 20
-"""Memory that a reader may take for a file of a few kilobytes."""
+"""Maximum memory of a reader for a file of a few kilobytes, bytes."""
 ROWS = 8
 T_S = np.arange(ROWS) / 50.0
 POSITIONS = np.random.default_rng(1).normal(size=(ROWS, 3, 3))
@@ -178,7 +178,7 @@ def test_a_damaged_file_is_read_or_refused(
 
 
 def npz_claiming(shape: str, data: bytes = b"") -> bytes:
-    """Return an NPZ whose array ``t`` claims a shape, whatever it holds."""
+    """Return an NPZ file whose array ``t`` declares a shape, independent of its content."""
     head = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".encode()
     head += b" " * (-(len(head) + 11) % 64) + b"\n"
     array = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head + data

@@ -1,7 +1,7 @@
 """``make load``: the daemon at the full rate of its inputs; every sample must have an outcome.
 
-Four IMUs fill serial lines of 921 600 baud, a sensor and strangers fill a CAN bus, and cameras send
-60 markers at 300 Hz. The inputs pause and are counted, send for the given time, pause and are
+Four IMUs fill serial lines of 921 600 baud. A sensor and foreign frames fill a CAN bus. Cameras
+send 60 markers at 300 Hz. The inputs pause and are counted, send for the given time, pause and are
 counted again. The command returns 1 if a sample was not received, was dropped or has no outcome.
 """
 
@@ -45,7 +45,7 @@ RATES_HZ = dict.fromkeys(SERIAL, 400) | {"S5": 100, "mocap": 300}
 BITRATE = 500_000
 STRANGER = CanFrame(0, 0x123, bytes(8))
 STRANGERS_HZ = BITRATE // frame_bits(8, extended=False) - 4 * RATES_HZ["S5"]
-"""Frames of strangers per second that fill the bus beside four frames of each sample."""
+"""Number of foreign frames per second that fill the bus, in addition to four frames per sample."""
 MARKERS = tuple(f"M{number}" for number in range(60))
 SETTLE_S = 2.0
 """Pause of the inputs before they are counted, s."""
@@ -157,7 +157,7 @@ def _turned(t_s: float) -> tuple[float, float, float, float]:
 
 
 async def measure(folder: Path, port: int, seconds: float) -> dict[str, Any]:
-    """Send for `seconds`; return what was sent and what became of it."""
+    """Send for `seconds`; return the numbers of sent samples and of their outcomes."""
     inputs = Inputs(folder)
     values = {"port": port, "base": BASE, "folder": folder, "bitrate": BITRATE}
     text = RIG.format(mocap=inputs.server.command_port, **values)

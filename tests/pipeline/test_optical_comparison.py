@@ -1,4 +1,4 @@
-"""The optical reference, and the residuals of the IMUs against it."""
+"""The optical reference, and the differences of the IMUs from it."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def vector(point: np.ndarray) -> Vector:
 
 
 def limb_states(shank_error: Rotation | None = None) -> list[LimbState]:
-    """Return states with the true bones, the shank turned in its own axes by an error."""
+    """Return states with the true bones; an error rotates the shank in its own axes."""
     moving, wrong = truth(), shank_error or Rotation.identity()
     t = np.arange(moving.t_s[0], moving.t_s[-1], 1 / RATE_HZ)
     # Axes of the calibration: what the cameras see in the static pose, to a constant rotation.
@@ -107,7 +107,8 @@ def limb_states(shank_error: Rotation | None = None) -> list[LimbState]:
 def axes(segment: str) -> Rotation:
     """Return the constant rotation from the bone of the subject to the segment of its calibration.
 
-    By the first camera frame, in which the subject stands; the calibration may choose its axes.
+    The rotation is from the first camera frame, in which the subject stands. The calibration may
+    choose its axes.
     """
     comparison = OpticalComparison(CHAIN, calibration(), 1000.0)
     t_ns, frame = camera_frames()[0]
@@ -128,7 +129,7 @@ def compare(
     synced: bool = True,
     change: Callable[[MocapFrame], MocapFrame] = lambda frame: frame,
 ) -> list[OpticalState]:
-    """Feed camera frames 5 ms late between limb states, as they arrive."""
+    """Send camera frames with a delay of 5 ms between limb states, in order of arrival."""
     comparison = OpticalComparison(CHAIN, calibration(), rate_hz)
     frames, out = iter(camera_frames()), []
     t_ns, frame = next(frames)

@@ -51,11 +51,11 @@ NMEA = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"
 MODEM = b"AT+CGMI\r\r\nERROR\r\n"
 """Command of ModemManager and its echo."""
 MODEM_EVERY = 40
-"""Messages between two such commands."""
+"""Number of messages between two such commands."""
 SERVED_US, STALL_US = 200_000, 20_000
-"""A pose is checked if the simulated devices sent without a pause longer than `STALL_US` from
-`SERVED_US` before to `SERVED_US` after it: on a loaded machine this process may stop sending, and
-poses without sensors are then correct."""
+"""Conditions for the check of a pose, us. The simulated devices must have sent without a pause
+longer than `STALL_US`, from `SERVED_US` before the pose to `SERVED_US` after it. On a loaded
+machine, this process may stop sending, and poses without sensors are then correct."""
 APPEARS_S = 2.0
 """Limit from the appearance of a port to the availability of its device, s."""
 SHARED = XcdiIds(0x105, 0x106, 0x121, status_word=None, error=None)
@@ -139,7 +139,8 @@ class FaultyHardware:
         self.pushed_us: list[int] = []
         """UNIX time of each push, us."""
         self.refused = 0
-        """Messages of `modem` for which its line was full: a stalled daemon had not read it."""
+        """Number of messages of `modem` that its full line refused, because a paused daemon had not
+        read."""
 
     async def run(self) -> None:
         async with asyncio.TaskGroup() as tasks:

@@ -45,7 +45,7 @@ SETTINGS = (
 SETTLE_S = 0.7
 OUTPUT_HZ = 50.0
 LIVE_FRAMES = 210
-"""Frames of a live movement: one cycle of the slowest, abduction."""
+"""Number of frames of a live movement: one cycle of the slowest movement, abduction."""
 Pairs = list[tuple[dict[str, Any], "TrueLimbState"]]
 
 
@@ -86,7 +86,7 @@ async def calibrate(scene: Scene, listener: Listener, functional_s: float = 20.0
 
 
 async def live(scene: Scene, listener: Listener, folder: Path, motion: str) -> Pairs:
-    """Return the poses of one movement with the ground truth of their instants."""
+    """Return the poses of one movement with the ground truth at their times."""
     scene.command(f"play {motion}")
     await asyncio.sleep(SETTLE_S)
     poses = await listener.more_poses(LIVE_FRAMES)

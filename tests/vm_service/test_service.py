@@ -34,7 +34,7 @@ PLACES = (
     "/etc", "/etc/credstore", "/usr/lib", "/usr/share", "/var/lib", "/var/lib/private",
     "/var/log", "/var/log/private",
 )  # fmt: skip
-"""Where something of ours may be left."""
+"""Paths at which the package may leave files."""
 DEB, NEWER = "/mnt/jointfitd.deb", "/mnt/newer.deb"
 
 pytestmark = pytest.mark.usefixtures("machine")
@@ -58,7 +58,7 @@ def test_installation_creates_an_example_rig_and_starts_no_service() -> None:
 
 
 def outcome(phase: str, wanted: str, **arguments: object) -> dict[str, Any]:
-    """Run a phase of the calibration to its end and return what it came to."""
+    """Run a phase of the calibration to its end; return its final status."""
     with listening("calibration") as heard:
         said: dict[str, Any] = next(heard)  # what was before
         assert answer("calibrate", phase=phase, **arguments)["status"] == "accepted"
@@ -69,7 +69,7 @@ def outcome(phase: str, wanted: str, **arguments: object) -> dict[str, Any]:
 
 
 def collect(phase: str, wanted: str, **arguments: object) -> None:
-    """Run a phase of the calibration; again where a busy machine spoilt it."""
+    """Run a phase of the calibration; repeat it if a busy machine aborted it."""
     found = [outcome(phase, wanted, **arguments)]
     while found[-1]["phase"] != wanted and len(found) < 3:
         found.append(outcome(phase, wanted, **arguments))
@@ -77,7 +77,7 @@ def collect(phase: str, wanted: str, **arguments: object) -> None:
 
 
 def squatting() -> list[dict[str, Any]]:
-    """Return some poses in a row in which the knee bends, if it does."""
+    """Return some successive poses, in which the knee bends if the angles are available."""
     poses = messages("pose", count=100, seconds=30)
     knees = [pose["joints"]["knee"]["flexion_deg"] for pose in poses]
     known = [angle for angle in knees if angle is not None]

@@ -1,4 +1,4 @@
-"""Joint centers frame by frame: near the truth, honest about the error, never NaN."""
+"""Joint centers frame by frame: accuracy, predicted error, and no NaN."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration.guidance import MovementStatus
 
 EVERY = 24
-"""Frames between two looks."""
+"""Number of frames between two status checks."""
 
 
 @cache
@@ -60,7 +60,7 @@ def watched(
     positions: np.ndarray,
     settings: CalibrationSettings = SETTINGS,
 ) -> MovementStatus:
-    """Return the last look at a movement; no payload on the way holds NaN or infinity."""
+    """Return the last status of a movement; require finite values in all payloads."""
     guide = MovementGuide(CHAIN, settings, static)
     look = guide.look({}, 0.0)
     for i, frame in enumerate(frames(track, positions)):

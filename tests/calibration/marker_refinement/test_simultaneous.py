@@ -40,7 +40,7 @@ LOCKED = (True, True, True)
 
 
 def limb() -> ChainModel:
-    """Return a pelvis, a thigh and a shank; what lies near bone is locked."""
+    """Return a pelvis, a thigh and a shank; the markers near bone are locked."""
     rng = np.random.default_rng(3)
     segments = (
         Segment("pelvis"),
@@ -87,7 +87,7 @@ def test_without_noise_markers_are_found_where_they_are(method: RefinementMethod
 
 
 def test_the_step_is_that_of_the_whole_least_squares_problem() -> None:
-    """An oracle that eliminates nothing: scipy on poses and markers together."""
+    """The expected step is from SciPy, which solves for poses and markers together."""
     model, y = misplaced(limb()), seen(0.003)[::10]
     weights, free = np.ones(y.shape[:2]), ~model.locked
     problem = RefinementProblem(model, y, weights, free, 0.1, None)
@@ -162,7 +162,7 @@ def test_a_holdout_ends_the_work_and_gives_the_best_place_back() -> None:
 
 
 def clamped() -> ChainModel:
-    """Return the limb with a knee that its own walk overturns by up to 17 degrees."""
+    """Return the limb with a knee whose limits its own walk exceeds by up to 17 degrees."""
     model = limb()
     hip, knee = model.segments[1:]
     short = replace(knee, joint=replace(knee.joint, limits=(-0.5, 1.0)))

@@ -1,4 +1,4 @@
-"""The calibration refines the markers of a chain model, and uses them where they fit better."""
+"""The calibration refines the markers of a chain model, and uses them if they fit better."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def optical() -> OpticalTrack:
 
 
 def true_model() -> ChainModel:
-    """Return the synthetic subject; its joints are where the subject's are."""
+    """Return the model of the synthetic subject, with the subject's true joint positions."""
     segments = (
         Segment("pelvis"),
         Segment("thigh", "pelvis", Joint("ball")),

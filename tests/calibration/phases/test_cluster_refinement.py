@@ -1,4 +1,4 @@
-"""Markers that are not where the static pose saw them: refined on the movement, judged, told."""
+"""Markers that moved after the static pose: refinement, evaluation and reports."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def refined() -> RefinedClusters:
 
 
 def bias_deg(cluster: MarkerCluster) -> float:
-    """Return how far the thigh's orientation is off the bone's on average, the pose being zero."""
+    """Return the mean error of the thigh's orientation relative to the static pose, deg."""
     _, functional, moving = trials()
     optical = optical_of(functional)
     q = track_clusters(optical, {"thigh": cluster})["thigh"].q

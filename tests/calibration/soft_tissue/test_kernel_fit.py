@@ -1,4 +1,4 @@
-"""The kernel correction under bad input, and what it claims: each case is a verdict or a fit."""
+"""The kernel correction with bad input: each case yields an error message or a fit."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ DEG = np.deg2rad(1.0)
 
 
 class Knee:
-    """A thigh and what its two sensors and the shank say of it; skin follows the bend."""
+    """A thigh with two sensors and a shank; the soft-tissue artefact follows flexion."""
 
     def __init__(self, seed: int = 1, bend: float = 1.2) -> None:
         rng = np.random.default_rng(seed)
@@ -170,7 +170,7 @@ def test_one_frame_is_that_of_many_wherever_it_lies() -> None:
 
 
 def test_constant_offset_is_corrected_far_outside_the_training_range() -> None:
-    """Sensors that stood 4 deg off the bone all the time do so in a bend nobody trained, too."""
+    """Sensors with a constant offset of 4 deg are corrected, also outside the training range."""
     off = rot.exp(np.array([4.0 * DEG, -3.0 * DEG, 0.0]))
     near, far = Knee(bend=0.6), Knee(bend=2.4)
     for knee in (near, far):
@@ -212,7 +212,7 @@ def test_a_stored_model_with_wrong_types_is_found_wherever_they_are() -> None:
 
 
 def test_trial_with_much_upright_standing_is_fitted() -> None:
-    """Left out are the only frames that move: of what is left no leverage is above zero."""
+    """If the only moving frames are left out, the remaining frames have no leverage."""
     knee = Knee()
     for q in (*knee.sensors, knee.other, knee.bone):
         q[100:] = (1.0, 0.0, 0.0, 0.0)
@@ -223,7 +223,7 @@ def test_trial_with_much_upright_standing_is_fitted() -> None:
 
 
 def test_correction_is_zero_in_the_static_pose_for_any_training() -> None:
-    """The trend knows a constant; its weight is zero there, for no feature shows anything."""
+    """The trend contains a constant, whose weight is zero in the static pose."""
     knee = Knee(bend=2.0)
     off = rot.exp(np.array([4.0 * DEG, -3.0 * DEG, 0.0]))
     knee.sensors = [rot.multiply(q, off) for q in knee.sensors]

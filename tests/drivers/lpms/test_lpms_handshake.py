@@ -1,4 +1,4 @@
-"""The handshake of LPMS sensors: what is read, what is set, what is never sent, and each error."""
+"""The handshake of LPMS sensors: commands that are read, set and never sent, and errors."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ async def test_the_wrong_generation_is_refused_before_any_harm(
 
 
 async def test_commands_of_the_other_generation_do_harm_in_the_simulator(tmp_path: Path) -> None:
-    """Without an identification, the driver believes its settings: the trap that they name."""
+    """Without an identification, the driver uses its settings, which may be wrong."""
     third = device_on(tmp_path, generation=3, identifies=False)
     await refusal(third, make(tmp_path, generation=1), DeviceLostError)
     assert third.flash_writes > 0  # the read 04 of generation 1

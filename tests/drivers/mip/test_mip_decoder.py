@@ -205,7 +205,7 @@ def test_the_recording_has_no_orientation_of_the_device(shared_data: Path) -> No
 
 
 def test_raw_measurements_of_the_recording_give_an_orientation_each(shared_data: Path) -> None:
-    """All 4473 packets with time, acceleration and rate; the sensor lies flat, z down."""
+    """All 4473 packets have time, acceleration and rate; the sensor lies flat with z down."""
     pytest.importorskip("vqf")
     wire = (shared_data / "imu" / "microstrain" / "mip_data.bin").read_bytes()
     decoder = MipImu(settings(orientation="gateway", rate_hz=125, settle_s=0)).decoder()

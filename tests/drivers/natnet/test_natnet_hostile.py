@@ -1,4 +1,4 @@
-"""Numbers, names and answers that no NatNet server sends: bounded, counted, never believed."""
+"""Invalid numbers, names and answers: memory is bounded, and they are counted and not used."""
 
 from __future__ import annotations
 

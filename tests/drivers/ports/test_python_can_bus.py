@@ -1,4 +1,4 @@
-"""Buses of python-can: pump threads, errors told once, and what a user is told."""
+"""Buses of python-can: reader threads, errors reported once, and error messages."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ async def test_a_bus_of_python_can_is_shared_too() -> None:
 
 
 class Broken(can.BusABC):
-    """Stands where a vendor's library stands; fails when read."""
+    """Replacement for a vendor's library, which fails during reading."""
 
     def __init__(self, error: Exception) -> None:
         super().__init__(channel="x")

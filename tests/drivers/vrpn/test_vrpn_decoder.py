@@ -33,7 +33,7 @@ def report(sender: int, time_us: int, at: tuple[float, float, float] = (1, 2, 3)
 
 
 class Feeder:
-    """A decoder, and everything that it returned."""
+    """A decoder with all items that it returned."""
 
     def __init__(self, **settings: Any) -> None:
         table = {"driver": "vrpn", "server": "x", "up_axis": "z", **settings}
@@ -97,7 +97,7 @@ def test_bodies_hidden_in_turns_are_not_merged() -> None:
 
 
 def test_a_stall_of_the_server_costs_no_report() -> None:
-    """After a stall the mean period is too long, and the next reports follow closely."""
+    """After a pause, the mean period is too long, and the next reports follow closely."""
     feeder = Feeder()
     t_us = T0_US
     for n in range(60):

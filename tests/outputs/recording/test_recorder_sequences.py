@@ -57,7 +57,7 @@ class RecordingMachine(RuleBasedStateMachine):
         self.expected: list[int] = []
         """Numbers of the events that were given to the active recorder."""
         self.unsafe: list[int] = []
-        """Those since the last write: a kill loses them."""
+        """Numbers of the events since the last write, which a kill loses."""
         self.recorder = self.new_recorder(autostart=False)
 
     def new_recorder(self, *, autostart: bool) -> Recorder:
@@ -132,7 +132,7 @@ class RecordingMachine(RuleBasedStateMachine):
 
     @rule(order=st.permutations(["start", "stop", "start", "_write"]))
     def storm(self, order: list[str]) -> None:
-        """Requests that come at once: none is answered with a recording that does not run."""
+        """Send simultaneous requests; no answer names a recording that does not run."""
 
         async def all_at_once() -> list[Any]:
             calls = (getattr(self.recorder, name) for name in order)
@@ -146,7 +146,7 @@ class RecordingMachine(RuleBasedStateMachine):
 
     @rule(autostart=st.booleans())
     def kill_daemon(self, autostart: bool) -> None:
-        """What was not yet written is lost; the file is repaired at the next start."""
+        """Kill the daemon: unwritten events are lost, and the next start repairs the file."""
         self.killed += len(self.unsafe)
         writer = self.recorder._writer
         if writer is not None and writer._part is not None:
@@ -172,7 +172,7 @@ class RecordingMachine(RuleBasedStateMachine):
 
     @override
     def teardown(self) -> None:
-        """The recorder can be stopped and started, and what is missing was counted."""
+        """Stop and start the recorder; the number of missing events must be known."""
         try:
             self.room_bytes = float("inf")
             self.stop()

@@ -1,4 +1,4 @@
-"""A chain model follows the markers of the cameras, without those that are faulty."""
+"""A chain model follows the markers of the cameras and excludes faulty markers."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def angles(t_s: float) -> tuple[float, float]:
 
 
 def markers(t_s: float) -> Array:
-    """Return the markers by scipy's rotations alone, m, shape (16, 3), in the order of NAMES."""
+    """Return the markers from SciPy's rotations alone, m, shape (16, 3), in the order of NAMES."""
     hip, knee = angles(t_s)
     pelvis = Rotation.from_euler("z", 40.0 + 5.0 * t_s, degrees=True)
     thigh = pelvis * Rotation.from_euler("XYZ", (hip, 5.0, -3.0), degrees=True)

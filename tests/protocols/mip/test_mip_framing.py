@@ -1,4 +1,4 @@
-"""MIP framing: any bytes, any cut, every byte accounted for."""
+"""MIP framing: any bytes in any chunks; every byte is accounted for."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""VectorNav framing: any bytes, any cut, every byte accounted for."""
+"""VectorNav framing: any bytes in any chunks; every byte is accounted for."""
 
 from __future__ import annotations
 
