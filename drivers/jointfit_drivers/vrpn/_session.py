@@ -164,7 +164,7 @@ class VrpnSession:
     # --- received chunks ----------------------------------------------------------------------
 
     def _take(self, chunk: Chunk) -> None:
-        """Emit one chunk, and store the consequences of its arrival."""
+        """Emit one chunk, and store its cookie and the times of its poses and pongs."""
         emit = self._output.emit_answer
         for message in self._codec.feed(chunk.data):
             match message:

@@ -50,8 +50,8 @@ _UNUSABLE = {
 _NEWEST = NewestKnown((1,), "the x-IMU3 GUI")
 """Newest supported firmware, which API 1.9 of the vendor's software reads."""
 _OLD_PULSE_US = 10_000_000
-_LONGEST_VERSION = 32
 """Largest difference, us, between an edge and the last measurement."""
+_LONGEST_VERSION = 32
 
 
 class _Measurement(NamedTuple):

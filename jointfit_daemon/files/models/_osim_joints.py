@@ -109,7 +109,7 @@ def _span(c: Coordinate) -> tuple[float, float]:
 def sampled_joint(
     joint: OsimJoint, motion: JointMotion, values: dict[str, Array]
 ) -> tuple[Array, Array]:
-    """Return R, shape (n, 3, 3), and t, shape (n, 3), of the child body in the parent body."""
+    """Return R, shape (n, 3, 3), and t, shape (n, 3), from child body to parent body."""
     count = max((len(v) for v in values.values()), default=1)
     defaults = {c.name: np.full(count, c.default) for c in joint.coordinates}
     others = {name: np.zeros(count) for name in motion.turning | motion.shifting}

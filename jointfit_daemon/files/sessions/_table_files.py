@@ -41,7 +41,8 @@ _NEEDS_QUOTES = frozenset(',"\n\r')
 def write_csv_session(session: SessionData, folder: Path) -> WrittenSession:
     """Write the tables as CSV.
 
-    Column names contain units, numbers 9 significant digits, times 1 ns.
+    Column names contain units. Numbers have 9 significant digits, and times have a resolution of
+    1 ns.
     """
     files = []
     for name, table in tables_of(session).items():

@@ -47,7 +47,7 @@ class CanFrame(NamedTuple):
     """One classic CAN frame."""
 
     t_ns: int
-    """Host CLOCK_MONOTONIC at the start of the frame, ns, as accurate as it is known."""
+    """Host CLOCK_MONOTONIC at the start of the frame, ns, as accurately as it is known."""
     can_id: int
     """Identifier of the frame. In an error frame, it contains the error classes."""
     data: bytes
@@ -82,7 +82,7 @@ def pack_frames(frames: Iterable[CanFrame]) -> bytes:
 
 
 def unpack_frames(data: bytes) -> list[CanFrame | CorruptBytes]:
-    """Return the frames in the records in `data`, which may be any bytes.
+    """Return the frames that the records in `data` contain; any bytes are accepted.
 
     A record that `pack_frames` cannot have written becomes 24 corrupt bytes, and unpacking
     continues with the next record. An incomplete last record is corrupt as well, because chunks

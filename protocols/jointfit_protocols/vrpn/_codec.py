@@ -105,7 +105,7 @@ class VrpnCodec:
         return self._lost
 
     def feed(self, data: bytes) -> list[VrpnContent | CorruptBytes]:
-        """Return the messages that `data` completes, in wire order; never raises."""
+        """Return the messages that `data` completes, in wire order; never raise."""
         buffer = self._buffer
         buffer += data
         if len(buffer) < self._needed:

@@ -32,7 +32,7 @@ _SEARCHED = 256
 numbers is shorter."""
 _MOST_PENDING = MAX_LINE + _SEARCHED
 _NEVER = 1 << 62
-"""Number added so that -1, the result of a search without a match, exceeds every position."""
+"""Modulus with which -1, the result of a search without a match, exceeds every position."""
 _QUATERNION = (0xD1, 26)
 """First byte and size of a binary message with a quaternion."""
 _SHORTEST_RUN = 4
@@ -77,7 +77,7 @@ class XImu3Codec:
         return len(self._pending)
 
     def feed(self, data: bytes) -> list[Found]:
-        """Return the messages that `data` completed, in wire order; never raises."""
+        """Return the messages that `data` completes, in wire order; never raise."""
         found: list[Found] = []
         buffer = self._pending + data if self._pending else data
         append, count = found.append, 0
