@@ -19,7 +19,7 @@ from paho.mqtt.properties import Properties
 
 RATE_HZ, SECONDS = 1000, 10.0
 _TURN_S = 0.005
-"""Time whose requests are sent in one burst, s."""
+"""Time between two bursts of requests, s."""
 
 
 _Properties: Any = Properties  # the constructor has no annotations

@@ -85,7 +85,7 @@ def normalized_errors(data: Path) -> list[Result]:
 def _joint(trial: KneeTrial) -> tuple[Array, Array, Array]:
     """Return the regressors of a joint fit, and two joint rotations.
 
-    The rotations are those of the sensor means and of the reference.
+    One rotation is from the sensor means, and the other is from the reference.
     """
     a, b, c, d = trial.sensors
     seen = joint_rotation(fuse([a, b], EQUAL), fuse([c, d], EQUAL))

@@ -191,7 +191,7 @@ def flexion_scores(
 def joint_scores(
     models: Sequence[SegmentModel], alike: float, judged: KneeTrial
 ) -> NDArray[np.float64]:
-    """Return the normalized flexion errors for two models with error correlation `alike`."""
+    """Return the normalized flexion errors of two models; `alike` is their error correlation."""
     said, claimed = [], []
     for model, segment in zip(models, fusion_methods.segments(judged), strict=True):
         said.append(model.predict(segment.sensors, segment.other))

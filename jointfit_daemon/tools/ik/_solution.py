@@ -53,8 +53,8 @@ _FEWEST_MARKERS = 3
 """Minimum number of visible markers in a frame with a solution. Fewer markers do not determine the
 position of the first segment."""
 _MISFIT_RAD = 0.0017
-"""Threshold of a note, rad (0.1 degrees): the rotation that the coordinates of the model cannot
-represent."""
+"""Rotation that the coordinates of the model cannot represent, above which a note is given, rad
+(0.1 degrees)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,7 +41,7 @@ def decode(topic: str, payload: Any) -> BaseModel | None:
 
 
 def decode_answer(command: str, data: Any) -> BaseModel:
-    """Return the ``data`` of an answer as its model; the errors are those of `decode`."""
+    """Return the ``data`` of an answer as its model, with the same errors as `decode`."""
     return _validated(ANSWERS[command], f"bridge/response/{command}", data)
 
 
