@@ -489,7 +489,7 @@ class ChainModelState(NamedTuple):
     model: str
     """Name of the chain model."""
     refined: bool
-    """Whether the model's marker positions come from the calibration in force."""
+    """Whether the model's marker positions come from the current calibration."""
     coordinates: tuple[ModelCoordinate, ...]
     errors: Mapping[str, float | None]
     """Distance of each marker from its position in the model, m; None if the marker is not

@@ -107,7 +107,7 @@ class CalibratableSettings(Protocol):
 
     @property
     def sensor_calibration(self) -> SensorCalibrationSettings | None:
-        """Calibration in force; None if there is none."""
+        """Current calibration; None if there is none."""
 
     def for_readings(self) -> Any:
         """Return settings whose decoder returns each uncorrected reading as a sample.

@@ -50,7 +50,7 @@ class StaticJob:
     alignment: Mapping[str, Any] | None = None
     """JSON form of the `PlateAlignment` of this session; None without an align phase."""
     previous: Calibration | None = None
-    """The calibration in force."""
+    """The current calibration."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ class FunctionalJob:
     alignment: Mapping[str, Any] | None = None
     """JSON form of the `PlateAlignment` of this session; None without an align phase."""
     previous: Calibration | None = None
-    """The calibration in force."""
+    """The current calibration."""
     lag_ns: Mapping[str, int] | None = None
     """Configured lags by sensor, ns."""
     tracked: Mapping[str, tuple[float, float]] | None = None
@@ -81,7 +81,7 @@ class RefitJob:
 
     chain: Chain
     previous: Calibration
-    """The calibration in force."""
+    """The current calibration."""
     fresh: OnlineFrames
 
 
@@ -108,12 +108,12 @@ class FitResult:
     """JSON form of the `PlateAlignment` that was fitted."""
     calibration: Calibration | None = None
     worse: str | None = None
-    """Reason why the calibration in force is better than `calibration`."""
+    """Reason why the current calibration is better than `calibration`."""
     kept: str | None = None
-    """Reason why a refit does not replace the models in force."""
+    """Reason why a refit does not replace the current models."""
     notes: tuple[str, ...] | None = None
-    """One sentence for each sensor that appears re-donned since the calibration in force. None if
-    no calibration is in force.
+    """One sentence for each sensor that appears re-donned since the current calibration. None if
+    no calibration is in use.
     """
     refused: str | None = None
     """Reason why there is no result; the other fields are then unused."""

@@ -269,7 +269,7 @@ class OnlineQuality:
     before_rad: Mapping[str, float]
     after_rad: Mapping[str, float]
     known_before_rad: Mapping[str, float]
-    """Errors of the models in force on the training frames of the calibration, rad."""
+    """Errors of the current models on the training frames of the calibration, rad."""
     known_after_rad: Mapping[str, float]
     rounds: int | None = None
     """Number of accepted refits since the functional calibration."""

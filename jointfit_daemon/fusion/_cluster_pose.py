@@ -5,6 +5,8 @@ change from frame to frame are computed once for each set of visible markers. Th
 uses plain floats. For matrices this small the overhead of a NumPy call exceeds the time of the
 arithmetic. The overhead is several times larger if the processor caches no longer contain the code
 of NumPy.
+
+The *static world* is the optical world as it was during the static pose.
 """
 
 from __future__ import annotations

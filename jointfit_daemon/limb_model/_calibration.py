@@ -3,6 +3,10 @@
 Invariants: ``Calibration.from_dict(c.to_dict()) == c`` to the last bit, even after a conversion to
 JSON text. The record never contains NaN or infinity. Time of creation and software version are
 arguments of the caller.
+
+The *static world* is the coordinate system of the static pose. With cameras, it is the optical
+world as it was during the static pose: all points on a body part are stored in the coordinates
+that they had then. Without cameras, z is up, and all segments are upright and face +y.
 """
 
 from __future__ import annotations
@@ -32,8 +36,10 @@ lists the names.
 Procedure = Literal["corrected", "patent"]
 """Steps of a calibration and of the fusion that uses it.
 
-``patent`` uses only the published steps of the patent, with its regression and without correction
-of sensors. ``corrected`` includes the methods of this project.
+``patent`` uses only the published steps of the Chinese patent CN 114533039 B. It combines the
+sensors of a segment by the regression of quaternion components in the patent, without correction
+of heading drift and without exclusion of faulty sensors. ``corrected`` includes the methods of this
+project.
 """
 
 SCHEMA = 1
@@ -80,8 +86,8 @@ class CalibratedCenter:
     center: Vector
     """Position of the center, m."""
     covariance: tuple[Vector, Vector, Vector]
-    """Covariance of the center, m², which is 0 along `unseen`. Persistent residuals count once per
-    posture.
+    """Covariance of the center, m², which is 0 along `unseen`. Residuals from soft-tissue artefact
+    repeat with posture, so all frames together count as one observation of them.
     """
     unseen: tuple[Vector, ...]
     """Unit directions along which the movement did not determine the center."""
@@ -100,7 +106,9 @@ class JointCalibration:
     residual_rms: float | None = None
     """RMS residual of the distances between the markers and the center, m."""
     gap_rms: float | None = None
-    """RMS distance between the centers fixed in the two adjacent body parts, m."""
+    """RMS distance over the movement between two points, m: the center as a fixed point of the
+    proximal body part, and the center as a fixed point of the distal body part.
+    """
     rotation: CalibratedCenter | None = None
     """Center from the calibration movement, with which later estimates are compared. None if one
     side of the joint has no markers.

@@ -7,6 +7,8 @@ probable. If a cluster has nearly the same shape after an exchange, the exchange
 cluster. The joint centers of the cluster then differ from the joint centers of the adjacent
 clusters.
 
+The *static world* is the optical world as it was during the static pose.
+
 Invariant: an explanation is unique, because the cost of every other hypothesis is higher by at
 least `_MARGIN`. A search consists of short parts, which `LabelExamination` spreads over frames.
 """

@@ -1,4 +1,7 @@
-"""Marker clusters of body parts in the static pose, as arrays and as stored data."""
+"""Marker clusters of body parts in the static pose, as arrays and as stored data.
+
+The *static world* is the optical world as it was during the static pose.
+"""
 
 from __future__ import annotations
 

@@ -113,7 +113,7 @@ class Core:
         self._collector: OnlineFrameCollector
         self._comparison: OpticalComparison
         self._usable: Calibration | None = None
-        """The calibration in force; None if it does not fit the rig's chain."""
+        """The current calibration; None if it does not fit the rig's chain."""
         self._sensors_rate: RateDivider | None = None
         self._moving_centers: MovingCenters | None = None
         self._chain_tracker: ChainTracker | None = None

@@ -1,7 +1,7 @@
 """Detection of exchanged, mislabelled and displaced markers from the shapes of marker clusters.
 
 The monitor is used for rigs without a chain model. It compares the markers with the clusters of the
-calibration in force. Markers with faulty labels are hidden from fusion until they fit the clusters
+current calibration. Markers with faulty labels are hidden from fusion until they fit the clusters
 again. Invariant: a fault is reported when it has explained the frames of 2 s. Its end is reported
 after 2 s without this fault. Hidden markers neither begin nor end a fault.
 """
@@ -76,7 +76,7 @@ class LabelMonitor:
     chain : Chain
         The limb.
     calibration : Calibration
-        Marker clusters and joint centers in force.
+        Marker clusters and joint centers in use.
     """
 
     def __init__(self, chain: Chain, calibration: Calibration) -> None:
@@ -93,7 +93,7 @@ class LabelMonitor:
         self._hidden: NDArray[np.intp] = np.zeros(0, dtype=np.intp)
         """Columns of the mocap layout whose labels are faulty."""
         self.faults: dict[LabelFault, frozenset[str]] = {}
-        """Faults in force. The markers of the listed body parts must be visible to end a fault."""
+        """Current faults. The markers of the listed body parts must be visible to end a fault."""
         self.misfits: frozenset[str] = frozenset()
         """Body parts whose markers do not fit, and for which no fault is an explanation."""
 
@@ -227,7 +227,10 @@ class LabelMonitor:
 
 
 def _centers(chain: Chain, calibration: Calibration) -> dict[tuple[str, str], Vector]:
-    """Return the known joint centers in the static world, m, by pairs of adjacent body parts."""
+    """Return the known joint centers in the optical world during the static pose, m.
+
+    The keys are pairs of adjacent body parts.
+    """
     parts, found = body_parts(chain), {}
     for name, (proximal, distal) in zip(chain.joints, joint_parts(chain), strict=True):
         joint = calibration.joint.get(name)

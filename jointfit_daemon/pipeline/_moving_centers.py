@@ -47,15 +47,15 @@ class MovingCenters:
 
     .. math:: D^2 = \delta^T (C + C_{calibrated})^{-1} \delta \sim \chi^2_r,
 
-    over the r directions that both movements observed. Some residuals persist, for example those
-    from soft-tissue artefact. They are counted once per posture in both covariances.
+    over the r directions that both movements observed. Residuals from soft-tissue artefact repeat
+    with posture. In both covariances, all frames together count as one observation of them.
 
     Parameters
     ----------
     chain : Chain
         The limb.
     calibration : Calibration or None
-        The calibration in force. Without a calibration, nothing is estimated.
+        The current calibration. Without a calibration, nothing is estimated.
     memory_s : float
         Time constant T, s; 0 disables the estimates.
     """

@@ -73,7 +73,7 @@ class OpticalComparison:
     chain : Chain
         The limb.
     calibration : Calibration or None
-        The calibration in force. Without a calibration, nothing is compared.
+        The current calibration. Without a calibration, nothing is compared.
     rate_hz : float
         Largest number of compared mocap frames per second.
     """

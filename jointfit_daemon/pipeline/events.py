@@ -273,17 +273,17 @@ class CalibrationStatus:
     phase: CalibrationPhase
     text: str
     version: int | None = None
-    """Version of the calibration in force; None if there is none, or if it is not stored."""
+    """Version of the current calibration; None if there is none, or if it is not stored."""
     quality: Mapping[str, object] = field(default_factory=dict)
-    """Quality of the result of the last phase; otherwise of the calibration in force."""
+    """Quality of the result of the last phase; otherwise of the current calibration."""
     kept: str | None = None
-    """Reason why a new result was rejected, so that the calibration in force stays in use."""
+    """Reason why a new result was rejected, so that the current calibration stays in use."""
     refused: Mapping[str, object] = field(default_factory=dict)
     """Quality of the rejected result."""
     done: tuple[CalibrationPhase, ...] = ()
     """Recorded phases whose results the functional phase uses."""
     created_utc: str | None = None
-    """Date of the version in force, ISO 8601; None if there is no version or its date is
+    """Date of the current version, ISO 8601; None if there is no version or its date is
     unknown."""
 
     @property

@@ -148,7 +148,7 @@ class CoreHealth:
     devices: Mapping[str, DeviceHealth] = field(default_factory=dict)
     phase: CalibrationPhase = CalibrationPhase.UNCALIBRATED
     version: int | None = None
-    """Version of the calibration in force."""
+    """Version of the current calibration."""
     fusion: Mapping[str, object] = field(default_factory=dict)
     """Report on the consistency of the sensors, as a JSON object."""
     lags: Mapping[str, LagHealth] = field(default_factory=dict)

@@ -35,7 +35,7 @@ class OfflineCalibration:
     """Result of the calibration phases of a recording."""
 
     rig: Rig
-    """The rig that was in force at the end."""
+    """The configuration at the end of the session."""
     calibration: Calibration | None
     """Last new calibration, with the date of its result; None if no phase yielded a calibration."""
     rejected: str | None

@@ -49,7 +49,7 @@ class Changes:
     rig: Rig | None = None
     """Rig that replaces the recorded rigs; None to use the recorded rigs."""
     calibration: Calibration | None = None
-    """Calibration in force from the first to the last event; None to use the recorded
+    """Calibration to use from the first to the last event; None to use the recorded
     calibrations."""
     compute_fits: bool = False
     """Whether fits are computed again even if nothing else changes."""
@@ -128,7 +128,7 @@ class _ChangedRun:
             if isinstance(event, JobFinished) and waiting is not None and waiting.job == event.job:
                 yield from self._finish_job(waiting, event.t_ns)
         else:
-            # A given calibration must stay in force. Requests for a fit or for another calibration
+            # A given calibration must stay in use. Requests for a fit or for another calibration
             # are therefore omitted.
             requested = isinstance(event, Request) and event.command != "mark"
             other = requested or isinstance(event, CalibrationSelected)

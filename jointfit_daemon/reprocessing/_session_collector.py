@@ -1,7 +1,7 @@
 """Collection of the measurements and outputs of a core as arrays of a session.
 
 All series share the time axis of the cameras. For this purpose, the lag of each sensor is
-subtracted from its stamps; the lags are those of the calibration in force at the end. Rows whose
+subtracted from its stamps; the lags are those of the calibration in use at the end. Rows whose
 instant is not later than the previous row are omitted, because a clock that settles or restarts may
 step back.
 """
@@ -188,7 +188,7 @@ class SessionCollector:
         Parameters
         ----------
         rig
-            Rig in force at the end.
+            Configuration at the end of the session.
         lags_ns
             Lag of each sensor behind the cameras, ns.
         description

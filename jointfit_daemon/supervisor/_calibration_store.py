@@ -127,7 +127,7 @@ class CalibrationWriter:
         self._next_try: asyncio.TimerHandle | None = None
         self._store = ""
         self.fault: str | None = None
-        """Reason why the calibration in force is not stored; None if it is stored."""
+        """Reason why the current calibration is not stored; None if it is stored."""
 
     def start(self, rig: Rig, calibration: Calibration, *, keep_date: bool = False) -> None:
         """Write a new version to the store of the rig; `keep_date` is described at `save`."""
@@ -174,8 +174,8 @@ class CalibrationWriter:
             if newest:
                 self._unwritten = self.fault = None
 
-        # The number is not the version of the calibration in force if a newer calibration is in
-        # force, or if a reload selected another store.
+        # The number is not the version of the current calibration if a newer calibration is in
+        # use, or if a reload selected another store.
         if newest and rig.calibration_store == self._store:
             self._deliver(CalibrationStored(time.monotonic_ns(), version, dated.created_utc))
 

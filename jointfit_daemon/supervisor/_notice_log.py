@@ -40,7 +40,7 @@ class NoticeLog:
     Parameters
     ----------
     rig
-        The rig in force.
+        The current rig.
 
     Attributes
     ----------

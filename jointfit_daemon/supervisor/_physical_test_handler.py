@@ -37,7 +37,7 @@ class TestedDaemon(Protocol):
 
     @property
     def rig(self) -> Rig:
-        """The rig in force."""
+        """The current rig."""
 
     def health(self) -> BridgeHealth:
         """Return the counters and clocks of this instant."""

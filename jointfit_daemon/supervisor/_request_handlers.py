@@ -1,4 +1,7 @@
-"""Handlers of the requests that the daemon executes itself instead of the core.
+"""Handlers of the MQTT requests that the daemon executes.
+
+The core (`jointfit_daemon.pipeline`) executes the other requests: ``calibrate``, ``static`` and
+``mark``.
 
 Invariant: a handler that refuses a request changes nothing.
 """
@@ -47,7 +50,7 @@ class DaemonInterface(TestedDaemon, Protocol):
         """Load rig.toml again and apply it. Raise `ConfigError` if the file is faulty."""
 
     async def set_output_rate(self, rate_hz: float) -> None:
-        """Apply the rig in force with a different output rate."""
+        """Apply the current configuration with another output rate."""
 
     async def settle_store(self) -> None:
         """Wait until no calibration is being written."""
@@ -113,7 +116,11 @@ class RequestHandlers:
         return request.reply("accepted", {"device": name})
 
     async def rate(self, request: Request) -> Reply:
-        """Change the output rate. A rate above the rates of all sensors is refused."""
+        """Change the output rate.
+
+        The request is refused if the rate exceeds the sample rates of all sensors, or while a
+        calibration phase is running.
+        """
         rig, rate_hz = self._daemon.rig, float(str(request.arguments["hz"]))
         fastest_hz = max(s.rate_hz for s in rig.sources if s.kind == "imu")
         fault = None
@@ -145,9 +152,9 @@ class RequestHandlers:
 
     async def use_calibration(self, request: Request) -> Reply | None:
         """Load a stored version and pass it to the core, which sends the answer."""
-        # The calibration in force has no version number until its file is written. A revert in the
-        # meantime would find this file as the newest version, and would select the calibration that
-        # it should replace.
+        # A new calibration has no version number until its file is written. Without a number,
+        # `before` searches all files. If the file were written just before this search, a request
+        # to revert would find it, and would select the calibration that it should replace.
         await self._daemon.settle_store()
         rig, in_force = self._daemon.rig, self._daemon.health().core.version
         version = request.arguments.get("version")

@@ -75,7 +75,7 @@ def self_test(rig: Rig, health: BridgeHealth, host: HostState) -> list[Finding]:
     Parameters
     ----------
     rig
-        The rig in force.
+        The current rig.
     health
         Counters and clocks of this instant.
     host

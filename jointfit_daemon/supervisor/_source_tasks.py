@@ -207,7 +207,7 @@ def _device_identity(path: str | None) -> object:
 
 
 class SourceTasks:
-    """Tasks of the sources of the rig in force.
+    """Tasks of the sources of the current rig.
 
     Parameters
     ----------

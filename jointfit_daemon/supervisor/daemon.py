@@ -329,7 +329,7 @@ class Daemon:
 
     @property
     def rig(self) -> Rig:
-        """The rig in force."""
+        """The current rig."""
         return self._rig
 
     def feed(self, event: Event) -> None:
@@ -349,7 +349,7 @@ class Daemon:
         await self._calibrations.settle()
 
     async def set_output_rate(self, rate_hz: float) -> None:
-        """Apply the rig in force with a different output rate, until the next reload."""
+        """Apply the current configuration with another output rate, until the next reload."""
         async with self._changes:
             await self._change_to(replace(self._rig, output_rate_hz=rate_hz))
 
@@ -460,7 +460,7 @@ class Daemon:
         Raises
         ------
         ConfigError
-            The file is faulty. The running configuration stays in force.
+            The file is faulty. The running configuration stays in use.
         """
         async with self._changes:
             self._systemd.reloading()

@@ -1,4 +1,7 @@
-r"""Decoder of the mode UART-RVC: converts Euler angles to samples with canonical orientation.
+r"""Decoder of the mode UART-RVC: converts Euler angles to samples with quaternions.
+
+The orientation of a sample is *canonical*: a Hamilton unit quaternion, scalar first, from the
+sensor to a world with x east, y north and z up (`jointfit_protocols.orientation`).
 
 According to the data sheet, yaw, pitch and roll are successive rotations about z, y and x
 (``zyx``). The example message of the data sheet contradicts this. It contains pitch -1.10 and roll

@@ -1,4 +1,7 @@
-"""Conversion of LPMS quaternions, as sent, to the canonical orientation.
+"""Conversion of the quaternions that LPMS devices send to canonical orientations.
+
+The orientation of a sample is *canonical*: a Hamilton unit quaternion, scalar first, from the
+sensor to a world with x east, y north and z up (`jointfit_protocols.orientation`).
 
 Invariant: the output depends only on the quaternions fed.
 """

@@ -1,4 +1,7 @@
-"""Decoder of MIP devices: converts chunks to samples in SI units with canonical orientation.
+"""Decoder of MIP devices: converts chunks to samples in SI units.
+
+The orientation of a sample is *canonical*: a Hamilton unit quaternion, scalar first, from the
+sensor to a world with x east, y north and z up (`jointfit_protocols.orientation`).
 
 MIP is the packet protocol of MicroStrain. The time of a sample comes from a field of the same
 packet. An orientation without time is stamped with its arrival, but it is rejected if earlier

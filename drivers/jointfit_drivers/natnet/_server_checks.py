@@ -1,4 +1,4 @@
-"""Checks whether the driver can work with a server, and their error messages.
+"""Checks of a NatNet server. If the driver cannot work with the server, an error names the remedy.
 
 Invariant: the module is pure. It checks every number of a SERVERINFO that other modules use.
 """
@@ -28,8 +28,9 @@ _LONGEST_VERSION = len("99.99")
 def connect_request(settings: NatNetSettings) -> Connect:
     """Return the CONNECT message to send, in the form that real servers answer.
 
-    Only a request for another bitstream from a unicast 4.x server has the form of the vendor's
-    sample program.
+    If the settings name a bitstream version, which only unicast 4.x servers can select, the message
+    has the form of the vendor's sample program (271 bytes). Otherwise it has the form of NatNetLib
+    3 (264 bytes).
     """
     wanted = settings.wanted_version
     if wanted is None:

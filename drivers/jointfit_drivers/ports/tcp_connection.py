@@ -100,7 +100,9 @@ class TcpConnection:
             The connection is lost, or the server does not read.
         """
         sent = self._socket.send(data)
-        if sent != len(data):  # a short request does not fit if the server does not read
+        # Requests are short, so one that does not fit into the send buffer of the kernel means that
+        # the server has not read the requests before it.
+        if sent != len(data):
             raise OSError(errno.ENOBUFS, "the server does not read its requests")
 
     def receive(self) -> ReceivedBytes | None:

@@ -1,4 +1,7 @@
-"""Decoder of VectorNav devices: converts chunks to samples in SI units with canonical orientation.
+"""Decoder of VectorNav devices: converts chunks to samples in SI units.
+
+The orientation of a sample is *canonical*: a Hamilton unit quaternion, scalar first, from the
+sensor to a world with x east, y north and z up (`jointfit_protocols.orientation`).
 
 Invariant: the output depends only on the chunks fed. The decoder reads no clock and no port.
 """

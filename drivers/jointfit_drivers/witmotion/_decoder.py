@@ -1,4 +1,7 @@
-"""Decoder of WitMotion devices: converts chunks to samples with canonical orientation.
+"""Decoder of WitMotion devices: converts chunks to samples in SI units.
+
+The orientation of a sample is *canonical*: a Hamilton unit quaternion, scalar first, from the
+sensor to a world with x east, y north and z up (`jointfit_protocols.orientation`).
 
 The frames of one sample follow each other in the order time, acceleration, rate, magnetic field,
 quaternion. No frame has a counter. The stamp of a sample is the arrival of its first byte.

@@ -1,4 +1,7 @@
-"""Decoder of Xbus devices: converts chunks to samples in SI units with canonical orientation.
+"""Decoder of Xbus devices: converts chunks to samples in SI units.
+
+The orientation of a sample is *canonical*: a Hamilton unit quaternion, scalar first, from the
+sensor to a world with x east, y north and z up (`jointfit_protocols.orientation`).
 
 The stamp of a sample is the arrival of its first byte. On a serial line, this is the arrival of the
 chunk minus the duration of the message and of all later bytes in the chunk, at ten bits per byte.
@@ -63,11 +66,15 @@ _ALIGNED = ("sensor", "local")
 _MESSAGES = frozenset(map(int, XbusMessageId))
 _MEASUREMENTS = (XbusMessageId.MT_DATA2, XbusMessageId.MT_DATA)
 _NEWEST = NewestKnown((1,), "MT Manager")
-"""Newest supported firmware, which all MTi series have since 2012."""
+"""Newest supported firmware version, 1.x. Firmware of all MTi series since 2012 has version 1.x."""
 
 
 class _Orientation(NamedTuple):
-    """A message with an orientation that is not classified yet."""
+    """A message with an orientation, from which no sample has been computed yet.
+
+    The message may be held until the next orientation shows whether it is valid
+    (`XbusContinuity`).
+    """
 
     message: XbusMessage
     arrived_ns: int
@@ -215,7 +222,8 @@ class XbusDecoder:
             elif kind not in KNOWN_ITEMS:
                 out += self._newer.take_unknown(f"item 0x{kind:04X}", self._last_ns)
 
-        # Unknown items are counted first, because a layout skips them.
+        # A stored layout skips unknown items. It is therefore stored only when all kinds of unknown
+        # items so far have occurred often enough to be reported.
         if len(data) not in self._layouts and self._newer.is_settled:
             self._layouts[len(data)] = MTData2Layout.of(items, self._wanted)
         return out + self._decode_values(message, values, world_id)
@@ -241,7 +249,7 @@ class XbusDecoder:
     def _decode_values(
         self, message: XbusMessage, values: Mapping[int, Any], world_id: int
     ) -> list[Decoded]:
-        """Check counter and time of an MTData2 message, and return its content."""
+        """Check counter and time of an MTData2 or MTData message, and return its content."""
         pulses: list[Decoded] = []
         for item, wire in self._wires.items():
             edge = values.get(item)

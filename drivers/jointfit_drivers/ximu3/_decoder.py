@@ -1,4 +1,7 @@
-"""Decoder of x-IMU3 devices: converts chunks to samples in SI units with canonical orientation.
+"""Decoder of x-IMU3 devices: converts chunks to samples in SI units.
+
+The orientation of a sample is *canonical*: a Hamilton unit quaternion, scalar first, from the
+sensor to a world with x east, y north and z up (`jointfit_protocols.orientation`).
 
 The stamp of a sample is the arrival of its first byte. On a serial line, this is the arrival of the
 chunk minus the duration of the message and of all later bytes in the chunk, at ten bits per byte.

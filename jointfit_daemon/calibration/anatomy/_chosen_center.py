@@ -1,5 +1,7 @@
 """Joint centers from an estimator that rig.toml selects instead of the default sphere fit.
 
+The *static world* is the optical world as it was during the static pose.
+
 Invariant: all coordinates are in the static world. Unobserved directions and leverage have the same
 meaning as in `joint_center`.
 """

@@ -3,6 +3,8 @@
 A fit is a `CenterEstimate` with its leverage. Its `unseen` directions are the directions that the
 movement did not excite. For example, the movement of a hinge does not determine the position of the
 center along the axis.
+
+The *static world* is the optical world as it was during the static pose.
 """
 
 from __future__ import annotations

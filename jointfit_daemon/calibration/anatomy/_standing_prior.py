@@ -4,6 +4,8 @@ If the arc of the movement is short, a center from skin markers has an uncertain
 across the limb. The uncertainty is largest at the ankle. Subjects who are asked to stand upright do
 so within a few degrees. The two sources of information are weighted by their covariances, in a
 linear Gaussian model.
+
+The *static world* is the optical world as it was during the static pose.
 """
 
 from __future__ import annotations

@@ -58,7 +58,8 @@ class LiveJointCenter:
 
     joint: str
     center: Array | None
-    """Position in the static world, m, shape (3,); None without an estimate."""
+    """Position in the optical world during the static pose, m, shape (3,); None without an
+    estimate."""
     noise: float
     """Random error, m: root mean variance of the observed directions; inf if no direction was
     observed.

@@ -1,4 +1,4 @@
-"""Comparison of a new calibration with the calibration in force. A rejection has a reason."""
+"""Comparison of a new calibration with the current calibration. A rejection has a reason."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class CalibrationComparison(NamedTuple):
 
 
 def compare_calibrations(new: Calibration, old: Calibration | None) -> CalibrationComparison:
-    """Compare a new calibration with the calibration in force.
+    """Compare a new calibration with the current calibration.
 
     The first criterion in which the calibrations differ determines the result. The order is: chain,
     use of cameras, alignment of the worlds, and finally the errors together. The errors are the

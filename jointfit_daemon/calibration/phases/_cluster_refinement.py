@@ -119,7 +119,7 @@ def refine_clusters(
 
 
 def _model(marked: Mapping[str, MarkerCluster]) -> ChainModel:
-    """Return a model of the unconnected parts with the axes of the static world."""
+    """Return a model of the unconnected parts with the axes of the optical world."""
     return ChainModel(
         tuple(Segment(name) for name in marked),
         tuple(

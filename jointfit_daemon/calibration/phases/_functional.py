@@ -91,7 +91,7 @@ MIN_SEEN = 0.5
 PLATE_SD_NS = 500_000.0
 """Assumed standard deviation of a lag from the align phase if the phase did not estimate it, ns."""
 STORED_SD_NS = 3e6
-"""Standard deviation of a lag from the calibration in force, ns. Such a lag may contain an error
+"""Standard deviation of a lag from the current calibration, ns. Such a lag may contain an error
 from soft-tissue artefact.
 """
 

@@ -124,13 +124,13 @@ def _refit(job: RefitJob) -> FitResult:
 
 
 def _previous(job: StaticJob | FunctionalJob | RefitJob) -> Calibration | None:
-    """Return the calibration in force if it belongs to the same limb and sensors."""
+    """Return the current calibration if it belongs to the same limb and sensors."""
     previous = job.previous
     return previous if previous is not None and previous.fits(job.chain) else None
 
 
 def _alignment(job: StaticJob | FunctionalJob) -> PlateAlignment | None:
-    """Return the alignment of this session, or else of the calibration in force, or else None."""
+    """Return the alignment of this session, or else of the current calibration, or else None."""
     if job.alignment is not None:
         return PlateAlignment.from_dict(job.alignment)
     previous = _previous(job)

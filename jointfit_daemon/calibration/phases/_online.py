@@ -2,8 +2,8 @@
 
 Online learning changes only the models, not sensor-to-segment alignments, joint centers or lags. A
 candidate is fitted to the training frames of the calibration and the older part of the new frames.
-The candidate is compared with the models in force on the newest frames, which are held out. The
-models in force are retained, with a reason, in three cases: the candidate is not better, is much
+The candidate is compared with the current models on the newest frames, which are held out. The
+current models are retained, with a reason, in three cases: the candidate is not better, is much
 worse on the earlier training frames, or differs too much. Inconsistent cameras and sensors are an
 error.
 """
@@ -54,7 +54,7 @@ FEWEST = 200
 HELD = 0.3
 """Fraction of the new frames, the newest, that is held out."""
 GAIN = 0.97
-"""Largest ratio of the candidate's error to the error of the models in force, on held-out frames.
+"""Largest ratio of the candidate's error to the error of the current models, on held-out frames.
 """
 GAIN_RAD = np.deg2rad(0.05)
 """Smallest decrease of the error with which the candidate is accepted, rad."""
@@ -72,9 +72,9 @@ MARKERS_RMS_M = 0.015
 MOST_LEFT_OUT = 0.3
 """Largest share of ignored frames."""
 CONTRADICTED = np.deg2rad(8.0)
-"""Median angle between cameras and models in force above which one of the two is wrong, rad."""
+"""Median angle between cameras and current models above which one of the two is wrong, rad."""
 SHIFTED = np.deg2rad(5.0)
-"""Largest mean rotation between cameras and models in force, rad. A displaced marker cluster causes
+"""Largest mean rotation between cameras and current models, rad. A displaced marker cluster causes
 a larger rotation.
 """
 TURN_FRAMES = 150
@@ -89,7 +89,7 @@ def refit_models(
     Parameters
     ----------
     calibration : Calibration
-        Calibration in force; its ``memory`` contains the training frames.
+        Current calibration; its ``memory`` contains the training frames.
     frames : OnlineFrames
         New frames.
 
@@ -98,7 +98,7 @@ def refit_models(
     FitResult
         Result whose ``quality["online"]`` contains the errors before and after, rad. If the
         candidate is accepted, ``calibration`` is set. Otherwise ``kept`` contains the reason to
-        retain the models in force.
+        retain the current models.
 
     Raises
     ------

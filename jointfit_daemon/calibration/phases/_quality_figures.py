@@ -1,4 +1,7 @@
-"""Quality figures and notes on the lags and the anatomy of a functional calibration."""
+"""Quality figures and notes on the lags and the anatomy of a functional calibration.
+
+The *static world* is the optical world as it was during the static pose.
+"""
 
 from __future__ import annotations
 

@@ -131,7 +131,8 @@ def fit_static_only(
 ) -> Calibration:
     """Calibrate without cameras, with all segments upright and the plain mean of the sensors.
 
-    Without an alignment, every sensor world is assumed to equal the static world, as in the patent.
+    Without an alignment, every sensor world is assumed to equal the world of the static pose, as in
+    the patent.
     If the headings of the sensors are arbitrary, only the inclination is then correct. The flag is
     ``headings_from_static``.
     """

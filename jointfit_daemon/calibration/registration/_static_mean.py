@@ -131,8 +131,8 @@ def static_mount(
     q_world_sensor : array_like, shape (n, 4)
         Frames of the static pose only.
     q_world_segment : array_like, shape (n, 4) or (4,)
-        Segment orientation in the same world. It is the identity in the static world, or the
-        orientation from the optical system.
+        Segment orientation in the same world. Without cameras it is the
+        identity, otherwise the orientation from the optical system.
     """
     return robust_mean(rotation.multiply(rotation.conjugate(q_world_sensor), q_world_segment))
 

@@ -1,8 +1,11 @@
 """Compact storage of training frames, with which online learning retains earlier movements.
 
 The number of frames is limited. They are spread evenly over postures, and are the newest frames of
-each posture. The encoding is text. A quaternion component is rounded to 1/32767, which is 0.003° of
-orientation.
+each posture. Postures are distinguished by the direction of gravity in the first segment and by the
+joint rotations. Each of these components is divided into cells of 0.25 rad.
+
+The encoding is text. A quaternion component is rounded to 1/32767, which is
+0.003° of orientation.
 """
 
 from __future__ import annotations

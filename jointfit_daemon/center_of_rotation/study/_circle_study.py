@@ -1,18 +1,19 @@
 r"""Monte Carlo study of the circle fits: maps of the error over arc, noise and radius.
 
-Invariant: one seeded generator supplies all random numbers. All runs of a cell are computed in one
-call.
-
 A marker at distance r from the center is at the angles 0, α and 2α; each coordinate has independent
 noise of standard deviation σ. In each map, two of the quantities r, σ and α vary, and the third is
-fixed. Every cell contains the RMS errors of the methods over many runs, and the predicted error for
-three frames,
+fixed. A map is a table, and each of its *cells* is one pair of values of the two quantities. For
+every cell, the study computes the RMS errors of the methods over many runs, and the predicted error
+for three frames,
 
 .. math:: F = \sigma \sqrt{\frac{2 + \cos\alpha}{(1 - \cos\alpha)^2 (1 + \cos\alpha)}}
 
-Every cell also contains the Cramér-Rao bound for many frames spread evenly over the same arc 0 …
-2α. Source: Akbarifar et al. 2021, section 2-2-3, figure 2 and table 1. The source prints only part
-of the setup; `StudySetup` documents the assumptions.
+It also computes the Cramér-Rao bound for many frames spread evenly over the same arc 0 … 2α.
+Source: Akbarifar et al. 2021, section 2-2-3, figure 2 and table 1. The source prints only part of
+the setup; `StudySetup` documents the assumptions.
+
+Invariant: one seeded generator supplies all random numbers, and each method computes all runs of a
+row of cells in one call. The results therefore depend only on the seed and the setup.
 """
 
 from __future__ import annotations
@@ -92,7 +93,8 @@ class PairMaps:
     frames.
     """
     refused: Array
-    """Fraction of the runs in which the Hyper fit is refused (T < 6)."""
+    """Fraction of the runs in which the Hyper fit is refused: there is no circle, or T is below
+    `GATE` (6). T is the radius divided by the largest standard error of the center."""
 
 
 def correlation(a: Array, b: Array, clip: float | None = None) -> float:
@@ -159,7 +161,10 @@ def run_study(
 
 
 def uniform_arc_rms(arc: float, frames: int, noise: float, *, known_radius: bool = False) -> float:
-    r"""Return `circle_rms_bound` for many points spread evenly over an arc, in closed form, m.
+    r"""Return the Cramér-Rao bound of the RMS error of a circle's center, in closed form, m.
+
+    The points are spread evenly over an arc, and there are many of them. `circle_rms_bound`
+    computes the bound for any points.
 
     .. math:: E^2 = \frac{\sigma^2}{n} \left[ \frac{2}{1-c} + \frac{2}{1+c-2s^2} \right],
               \quad s = \frac{\sin(\varphi/2)}{\varphi/2}, \quad c = \frac{\sin\varphi}{\varphi}

@@ -44,10 +44,11 @@ class XdfStream:
 
     header: ET.Element
     t_s: list[Array] = field(default_factory=list)
-    """Time stamps, s, on the clock of the sender. A stamp is NaN if it follows from the nominal
+    """Time stamps of each chunk, s, on the clock of the sender, shape (n,). NaN marks a sample
+    without a stamp in the file. Its time follows from the last stamp before it and the nominal
     rate."""
     values: list[Array] = field(default_factory=list)
-    """Numbers of each chunk, shape (n, channels)."""
+    """Samples of each chunk, shape (n, channels). Empty for a stream that contains strings."""
     texts: list[list[str]] = field(default_factory=list)
     """Samples of a stream that contains strings."""
     offsets: list[tuple[float, float]] = field(default_factory=list)
@@ -156,8 +157,10 @@ def _chunks(path: Path, data: bytes) -> Iterator[tuple[int, int, memoryview]]:
 
 def _xml(content: memoryview) -> ET.Element:
     text = bytes(content)
+    # A document type can define entities, and a short text with nested entities can expand to
+    # gigabytes.
     if len(text) > _LARGEST_XML or b"<!" in text:
-        raise ValueError("header too long, or with a document type")  # entities could grow
+        raise ValueError("header too long, or with a document type")
     return ET.fromstring(text)  # noqa: S314 - without a document type there are no entities
 
 

@@ -95,7 +95,7 @@ def metric_families(rig: str, health: BridgeHealth, frames: FrameStatistics) -> 
     health
         Counters of this instant.
     frames
-        Latency histogram and date of the calibration in force.
+        Latency histogram and date of the current calibration.
     """
     build = {"version": __version__, "rig": rig}
     yield InfoMetricFamily("jointfit_build", "Version of jointfitd and name of the rig.", build)

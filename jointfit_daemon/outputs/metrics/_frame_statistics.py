@@ -22,7 +22,7 @@ _LIMITS_NS = [round(limit * 1e9) for limit in LATENCY_LIMITS_S]
 
 
 class FrameStatistics:
-    """Latency histogram and date of the calibration in force; a `Sink` of the core.
+    """Latency histogram and date of the current calibration; a `Sink` of the core.
 
     Latency is the time from the arrival of the sample that completed a frame to the delivery of
     the frame to the outputs.
@@ -33,7 +33,7 @@ class FrameStatistics:
         """Number of frames in each bucket, not cumulative."""
         self.sum_ns = 0
         self.calibrated_s: float | None = None
-        """UNIX time at which the calibration in force was stored, s; None if unknown."""
+        """UNIX time at which the current calibration was stored, s; None if unknown."""
 
     def event(self, event: Event) -> None:
         """Store the date of a calibration that was loaded."""

@@ -40,7 +40,7 @@ class StateHealth:
     fault: str | None
     """Reason why the daemon cannot write to the state directory."""
     not_stored: str | None
-    """Reason why the calibration in force is not stored."""
+    """Reason why the current calibration is not stored."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,7 +32,7 @@ class Snapshot:
     """Configuration, calibration, open sources and UNIX time offset at one instant."""
 
     configured: Configured | None = None
-    """The configuration and the calibration in force."""
+    """The configuration and the current calibration."""
     calibrated_t_ns: int = 0
     """Instant to which `Configured.calibration_age_s` refers, CLOCK_MONOTONIC ns."""
     unix_offset_ns: int | None = None

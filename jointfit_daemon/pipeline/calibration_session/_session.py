@@ -84,7 +84,7 @@ class CalibrationSession:
     mocap : bool
         Whether the rig has a mocap source. Without mocap, only a static calibration is possible.
     calibration : Calibration or None
-        The calibration in force; None if there is none.
+        The current calibration; None if there is none.
     version : int or None
         Version of `calibration` in the store; None if it is not stored.
     """
@@ -101,7 +101,7 @@ class CalibrationSession:
         self._chain, self._settings, self._mocap = chain, settings, mocap
         self.calibration = calibration
         self.version = version
-        """Version of the calibration in force; None while it is not stored."""
+        """Version of the current calibration; None while it is not stored."""
         self._created_utc = "" if calibration is None else calibration.created_utc
         """Date of the calibration with the number `version`."""
         self.lags: LagMonitor | None = None
@@ -138,7 +138,7 @@ class CalibrationSession:
 
     @property
     def phase(self) -> CalibrationPhase:
-        """The running phase; if none is running, whether a calibration is in force."""
+        """The running phase; if none is running, whether a calibration is in use."""
         return self._resting_phase if self._state in RESTING else self._state
 
     @property
@@ -260,8 +260,8 @@ class CalibrationSession:
     def select(self, event: CalibrationSelected) -> list[Output]:
         """Use a stored calibration, and pause online learning until the next functional phase.
 
-        The calibration is stored again as a new version, because the newest version is the one in
-        force.
+        The calibration is stored again as a new version, because the daemon uses
+        the newest version after a restart.
         """
         request, chosen = event.request, event.calibration
         if self._state not in RESTING:
@@ -459,7 +459,7 @@ class CalibrationSession:
         ]
 
     def set_stored_version(self, event: CalibrationStored) -> list[Output]:
-        """Set the version of the calibration in force after it was stored."""
+        """Set the version of the current calibration after it was stored."""
         self.version, self._created_utc = event.version, event.created_utc
         return [self.status(event.t_ns, f"stored as version {event.version}")]
 
@@ -472,7 +472,7 @@ class CalibrationSession:
     ) -> CalibrationStatus:
         """Return a status.
 
-        By default, it describes the current phase and the calibration in force.
+        By default, it describes the current phase and the current calibration.
         """
         if quality is None:
             quality = {} if self.calibration is None else self.calibration.quality

@@ -96,12 +96,12 @@ class MarkerMonitor:
     _since_ns: dict[str, dict[str, int]] = field(default_factory=dict)
     """Start of each condition, by kind of condition and flag."""
     _faults: dict[str, tuple[int, ...]] = field(default_factory=dict)
-    """Markers concerned by each flag in force."""
+    """Markers concerned by each current flag."""
     _observed: dict[int, _Observation] = field(default_factory=dict)
     _began_ns: int | None = None
     _labels: SegmentLabels = field(init=False)
     _by_shape: set[str] = field(default_factory=set)
-    """Flags in force of exchanged markers that were found from the shapes of the segments."""
+    """Current flags of exchanged markers that were found from the shapes of the segments."""
 
     def __post_init__(self) -> None:
         self._labels = SegmentLabels(self.model)
@@ -110,7 +110,7 @@ class MarkerMonitor:
         self._seen_ns = [None] * count
 
     def flags(self, t_ns: int) -> tuple[str, ...]:
-        """Return the flags in force."""
+        """Return the current flags."""
         lost = [
             f"{MarkerFlag.LOST}:{marker.name}"
             for marker, seen_ns in zip(self.model.markers, self._seen_ns, strict=True)

@@ -74,7 +74,7 @@ class OnlineFrameCollector:
     chain : Chain
         The limb.
     calibration : Calibration or None
-        The calibration in force. No frame is collected if there is no calibration, if it contains
+        The current calibration. No frame is collected if there is no calibration, if it contains
         no movement data, or if it lacks the marker clusters of a segment.
     wanted : bool
         Value of ``learn_online`` in rig.toml.

@@ -59,8 +59,8 @@ if TYPE_CHECKING:
 _DETAIL_S = 10.0
 """Duration of the section of a long session that is drawn in detail, s."""
 _UNSHOWN = 0.1
-"""Share of the session. If no angles exist in a longer part at the beginning, for example during
-calibration, the curves begin at the first angle."""
+"""Largest share of the session that may pass before the first known angle. If the share is larger,
+for example because of a calibration, the curves begin at the first angle instead of the start."""
 _PANEL, _HALF = 320.0, 450.0
 """Widths of a panel, px, in a row of three and in a row of two panels."""
 _MOST_POINTS = 800
@@ -345,7 +345,8 @@ def comparison_section(results: SessionResults) -> str:
     ]
     head = ("Angle", "RMS", "Bias", "SD", "Limits of agreement", "Largest", "Inside interval")
 
-    # Draw one panel for each joint, with its first angle (flexion or elevation).
+    # Draw two figures for each joint, of its first angle (flexion or elevation): the difference
+    # over time, and the difference over the mean (Bland-Altman plot).
     shown: dict[str, AngleDifference] = {}
     for found in results.differences:
         shown.setdefault(found.joint, found)

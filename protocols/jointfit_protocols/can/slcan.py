@@ -2,8 +2,9 @@
 
 The stamps of frames are computed from the arrival time that the caller passes. On a serial line,
 the duration of the frame's characters and of all later characters is subtracted from the arrival.
-On USB, characters have no duration. The duration of the frames on the bus, where they follow each
-other, is then subtracted instead.
+On USB, the transmission of the characters takes no measurable time. Instead, the durations on the
+CAN bus of the frame and of all later frames in the same read are subtracted, as if the frames had
+followed each other without a pause.
 
     t iii l dd...    11-bit frame, l bytes     T iiiiiiii l dd...   29-bit frame
     r iii l          11-bit remote request     R iiiiiiii l         29-bit remote request
@@ -61,7 +62,7 @@ _COMMANDS: dict[int, range] = {
 
 
 class SlcanLine(NamedTuple):
-    """A line that contains no frame but an answer or a command."""
+    """A line that contains an answer or a command instead of a frame."""
 
     letter: str
     """First letter of the line. ``""`` means a single CR (done), and ``"\\a"`` means BELL
@@ -72,7 +73,8 @@ class SlcanLine(NamedTuple):
 def encode_frame(frame: CanFrame, time_ms: int | None = None) -> bytes:
     """Return `frame` as a line.
 
-    If `time_ms` is given, it is added modulo 60 000 as adapter time.
+    If `time_ms` is given, the line ends with the adapter time: `time_ms` modulo 60 000, in four
+    hexadecimal digits.
     """
     letter = ("rR" if frame.remote else "tT")[frame.extended]
 
@@ -137,9 +139,9 @@ class SlcanCodec:
         """Return the frames and lines that `data` completes, in wire order.
 
         The ``t_ns`` of a frame is the start of its line. It is the arrival `t_ns` minus the
-        duration of all characters from the start of the line on. On USB, the duration of the frames
-        on the bus is subtracted instead. The stamp of a line that lies completely in `data` is
-        never earlier than the previous call.
+        duration of all characters from the start of the line on. On USB, the durations on the bus
+        of this frame and of all later frames in `data` are subtracted instead. The stamp of a line
+        that lies completely in `data` is never earlier than the previous call.
         """
         found: list[CanFrame | SlcanLine | CorruptBytes] = []
         *lines, rest = (self._pending + data).replace(b"\n", b"").split(b"\r")
@@ -154,7 +156,8 @@ class SlcanCodec:
             after_ns -= (len(line) + 1) * self._character_ns or self._on_bus_ns(line)
             before -= len(line) + 1
 
-        # An overlong line is truncated to its end, in which a frame may have begun.
+        # An overlong line is shortened to its last `_WINDOW` characters, because a frame may have
+        # begun in them.
         rest = self._split_bells(rest, found)
         if len(rest) > _LONGEST:
             self._endless = True

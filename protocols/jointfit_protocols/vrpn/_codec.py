@@ -1,7 +1,8 @@
 """Codec of a VRPN byte stream: cookie, messages, and descriptions of senders and types.
 
-A datagram contains complete messages. The bytes of datagrams may therefore be fed between complete
-messages of a TCP connection. A message has no start pattern and no checksum. After an impossible
+A server sends messages by TCP and in UDP datagrams. A datagram contains only complete messages. If
+the caller feeds only complete messages of the TCP stream (`whole_messages`), it can feed datagrams
+in between. A message has no start pattern and no checksum. After an impossible
 length, everything up to the next cookie is discarded, and a driver closes the connection.
 
 Invariant: the codec converts bytes to messages. It uses no socket and no clock, and the boundaries
@@ -52,7 +53,7 @@ _FIRST = int.from_bytes(_MAGIC[:4], "big")
 _US = 1_000_000
 _POSE_BYTES = HEADER_BYTES + POSE_LAYOUT.size
 _RUN = 4096
-"""Number of bytes without a message after which they are reported."""
+"""Largest number of discarded bytes in one `CorruptBytes`. Longer runs are reported in parts."""
 
 
 class _Kind(IntEnum):
@@ -180,7 +181,11 @@ class VrpnCodec:
         return start
 
     def _cookie(self, at: int, found: list[VrpnContent | CorruptBytes]) -> int:
-        """Append the cookie at `at`, discard the previous peer; return the position after it."""
+        """Append the cookie at `at` to `found`, and return the position after the cookie.
+
+        The descriptions of the previous connection are discarded. If the bytes are no valid cookie,
+        one byte is discarded, and the search for a cookie continues.
+        """
         match = _COOKIE.fullmatch(self._buffer, at, at + COOKIE_BYTES)
         if match is None:
             self.discarded += 1
@@ -254,8 +259,8 @@ class VrpnCodec:
 def whole_messages(data: bytes) -> int:
     """Return the number of bytes of `data` up to the end of its last complete message or cookie.
 
-    The function decodes no content. An impossible length counts as the end of the data, because the
-    codec rejects it.
+    The function decodes no content. If a length is impossible, it returns the size of `data`, so
+    that the codec receives all bytes and rejects them.
     """
     at, end = 0, len(data)
     while end - at >= HEADER_BYTES:

@@ -127,7 +127,7 @@ class XImu3Reply(NamedTuple):
 
     key: str
     value: object
-    """Value in force; None in a command that reads the value."""
+    """Current value; None in a command that reads the value."""
     error: str | None = None
     """Reason why the device refused the command."""
     size: int = 0

@@ -1,8 +1,9 @@
 """Forward kinematics of a right leg: bones and joint centres from joint angles (ground truth).
 
-In the base world, z is up, and the subject faces +y at pelvis heading 0. The origin of a segment
-frame is the proximal joint centre. Its z axis extends from the distal to the proximal joint centre,
-y is anterior, and x is to the right.
+The *base world* is the world in which the movement of the subject is described. In it, z is up, and
+the subject faces +y at pelvis heading 0. The origin of a segment frame is the proximal joint
+centre. Its z axis extends from the distal to the proximal joint centre, y is anterior, and x is to
+the right.
 
 Invariant: in upright stance every segment frame is parallel to the base world.
 """

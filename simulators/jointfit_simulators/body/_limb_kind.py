@@ -5,6 +5,8 @@ columns of ``_limb.py``: position and orientation of the base, the angles of the
 plate. The base is the pelvis, or the thorax for an arm. Each of the three joints (per leg) has
 three angles.
 
+The *base world* is the world in which the movement of the subject is described, with z up.
+
 Invariant: in the static pose every segment frame is parallel to the base world.
 """
 

@@ -1,5 +1,7 @@
 """Simulated subject with bones, soft-tissue artefacts, sensors and markers, in the base world.
 
+The *base world* is the world in which the movement of the subject is described, with z up.
+
 Invariant: observations depend only on the time, the settings and the sequence of motions.
 """
 

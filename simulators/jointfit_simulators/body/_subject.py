@@ -1,4 +1,8 @@
-"""Interface of a simulated or recorded subject. Positions are in the base world (z up), m."""
+"""Interface of a simulated or recorded subject.
+
+Positions are in m, in the *base world*. This is the world in which the movement of the subject is
+described, with z up. Each sensor has its own world, and so do the cameras.
+"""
 
 from __future__ import annotations
 

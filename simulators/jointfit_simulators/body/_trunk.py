@@ -3,6 +3,8 @@
 The angles of a joint describe the upper part relative to the lower part: forward flexion, bending
 to the right, and rotation to the left.
 
+The *base world* is the world in which the movement of the subject is described, with z up.
+
 Invariant: a motion has two continuous derivatives.
 """
 

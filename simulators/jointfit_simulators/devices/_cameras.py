@@ -2,6 +2,8 @@
 
 Coordinates are in the optical world (z up), in m. The server converts them to its own axes.
 
+The *base world* is the world in which the movement of the subject is described, with z up.
+
 Invariant: rigid bodies are fitted to the skin markers. Only the reference bones of a recording are
 streamed without a fit.
 """

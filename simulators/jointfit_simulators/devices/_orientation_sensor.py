@@ -1,4 +1,7 @@
-"""Model of the orientation error of an IMU: world frame, slow drift and white noise."""
+"""Model of the orientation error of an IMU: world frame, slow drift and white noise.
+
+The *base world* is the world in which the movement of the subject is described, with z up.
+"""
 
 from __future__ import annotations
 

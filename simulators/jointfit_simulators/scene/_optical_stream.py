@@ -1,4 +1,4 @@
-"""Stream of camera frames, which are planned in blocks and sent one by one.
+"""Stream of camera frames, which are planned in blocks (computed in advance) and sent one by one.
 
 The optical world has z up in this module. The server converts to its own axes.
 

@@ -1,4 +1,6 @@
-"""Real-time scheduler of a scene, which plans blocks of 0.2 s and sends each sample in time.
+"""Real-time scheduler of a scene, which sends each sample in time.
+
+The scheduler *plans* blocks of 0.2 s: it computes all samples of a block before the block begins.
 
 Transmission times are absolute. Overdue samples are sent at once, in order and with their own time
 stamps. After an interruption of some seconds (a suspended machine), the missed time is skipped.

@@ -1,4 +1,6 @@
-"""Streams of IMU samples, one per device. Samples are planned in blocks and sent one by one.
+"""Streams of IMU samples, one per device.
+
+Samples are planned in blocks (computed in advance) and sent one by one.
 
 Invariant: a sample contains its sampling time, even if it is sent late. Every sample that a
 measuring device takes is counted as sent, as dropped (`Knobs.dropout`), or as refused by a full

@@ -1,9 +1,11 @@
 r"""Log of the ground truth of a run, with one JSON object per line.
 
 The values are true, not measured. They are in the optical world (z up), in m and rad, with
-quaternions (w, x, y, z).
+quaternions (w, x, y, z). The movement of the subject is computed in the *base world* (z up), and
+the optical world is the base world rotated about the vertical.
 
-Invariant: a line is written after its time, and is in the file within 0.2 s.
+Invariant: no line is written before its time. `advance` writes all lines whose time has passed. A
+running scene calls it every 0.1 s, so a line is in the file within 0.2 s.
 
 The first line is ``{"truth": 1, "t_ns": …, "knobs": {…}, "lengths_m": {…}, "joint": "knee", …}``.
 The other lines follow at 100 Hz::
@@ -15,8 +17,9 @@ The other lines follow at 100 Hz::
 
 The angles belong to the main joint: ``knee``, ``elbow`` or ``lumbar``. Knee flexion is positive
 with the heel back, adduction with the foot towards the midline, and rotation with the toes towards
-the midline. Lumbar flexion is positive forward, ``adduction`` is bending to the right, and rotation
-is positive to the left. The included angle is pi when straight. An unknown value is null.
+the midline. Elbow flexion is positive forward, and rotation is pronation. Lumbar flexion is
+positive forward, ``adduction`` is bending to the right, and rotation is positive to the left. The
+included angle is pi when straight. An unknown value is null.
 """
 
 from __future__ import annotations
@@ -62,7 +65,7 @@ class TruthLog:
     def add(
         self, t_ns: NDArray[np.int64], motions: list[str], truth: GroundTruth, world: Rotation
     ) -> None:
-        """Queue the ground truth of a planned block.
+        """Queue the ground truth of a block of time, which the scene computes in advance.
 
         Parameters
         ----------
