@@ -110,7 +110,7 @@ async def live(
         await listener.until(lambda: locked(listener), PATIENCE_S)
         for name in reboots:
             await asyncio.sleep(rest_s)
-            await simulator.say(f"reboot {name}")
+            await simulator.send_command(f"reboot {name}")
             await recovers(listener, name)
         await asyncio.sleep(rest_s)
         code, _ = await stopped(daemon)

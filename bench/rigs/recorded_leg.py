@@ -52,7 +52,7 @@ async def _record(folder: Path, kind: Kind, seconds: float, broker: Broker) -> P
             await calibrate(simulator, listener)
             await listener.until(lambda: listener.latest["calibration"]["version"])
         for number in range(round(seconds / MOTION_S)):
-            await simulator.say(f"play {MOTIONS[number % len(MOTIONS)]}")
+            await simulator.send_command(f"play {MOTIONS[number % len(MOTIONS)]}")
             await asyncio.sleep(MOTION_S)
         code, _ = await stopped(daemon)
         assert code == 0, station.log

@@ -122,10 +122,10 @@ class Gateway:
 
     async def play(self, motion: str) -> None:
         """Start a motion; return during its interpolation, when the cameras track no bodies."""
-        await self.sim.say(f"play {motion}")
+        await self.sim.send_command(f"play {motion}")
         async with asyncio.timeout(PATIENCE_S):
             while True:
-                await self.sim.say("status")
+                await self.sim.send_command("status")
                 if (await self.sim.answer()).get("motion") == motion:
                     return
                 await asyncio.sleep(POLL_S)

@@ -41,9 +41,9 @@ class BusEvents:
             return [DeviceEvent("warning", text, {"dropped_frames": lost})]
 
         text, serious = can.describe_error(frame)
-        return self.limited("error" if serious else "warning", text, frame.t_ns)
+        return self.limit_event("error" if serious else "warning", text, frame.t_ns)
 
-    def limited(self, kind: DeviceEventKind, text: str, t_ns: int) -> list[Decoded]:
+    def limit_event(self, kind: DeviceEventKind, text: str, t_ns: int) -> list[Decoded]:
         """Return an event, unless the same event was reported within a second before `t_ns`."""
         if text == self._text and 0 <= t_ns - self._reported_ns < _REPEAT_NS:
             return []

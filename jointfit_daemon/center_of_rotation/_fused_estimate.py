@@ -78,7 +78,7 @@ def fuse_centers(estimates: Sequence[CenterEstimate], *, robust: bool = True) ->
         if done:
             break
 
-    return _fused([estimates[k] for k in used], used, w, knowledge, centers)
+    return _combine([estimates[k] for k in used], used, w, knowledge, centers)
 
 
 def _information(estimate: CenterEstimate) -> Array:
@@ -93,7 +93,7 @@ def _information(estimate: CenterEstimate) -> Array:
     return np.asarray(across.T @ np.linalg.inv(shown) @ across)
 
 
-def _seen(total: Array) -> Array:
+def _observed_directions(total: Array) -> Array:
     """Return the directions in which the total information is not zero, as columns."""
     if total.size == 0:
         return total
@@ -105,10 +105,10 @@ def _weight(i: int, w: Array, knowledge: Array, centers: Array) -> float:
     """Return the Huber weight of estimate i, from its distance to the center of the others."""
     others = np.where(np.arange(len(w)) == i, 0.0, w)
     total = np.einsum("k,kab->ab", others, knowledge)
-    B = _seen(total)
+    B = _observed_directions(total)
     shown = B.T @ total @ B
     m = B @ np.linalg.solve(shown, B.T @ np.einsum("k,kab,kb->a", others, knowledge, centers))
-    own = _seen(B.T @ knowledge[i] @ B)
+    own = _observed_directions(B.T @ knowledge[i] @ B)
     if own.shape[1] == 0:
         return 1.0
     P = B @ own
@@ -120,11 +120,11 @@ def _weight(i: int, w: Array, knowledge: Array, centers: Array) -> float:
     return min(1.0, TOLERATED / max(distance, 1e-12)) ** 2
 
 
-def _fused(
+def _combine(
     estimates: list[CenterEstimate], names: list[int], w: Array, knowledge: Array, centers: Array
 ) -> CenterEstimate:
     total = np.einsum("k,kab->ab", w, knowledge)
-    B = _seen(total)
+    B = _observed_directions(total)
     if B.shape[1] == 0:
         reason = "no direction of the center was observable: increase the range of motion"
         return refusal("several", len(total), max(e.frames for e in estimates), reason)

@@ -165,7 +165,7 @@ _ALL = (
     _planar(
         "oriented",
         "circle and the child's measured angle",
-        each(_planar_methods.oriented),
+        each(_planar_methods.fit_oriented),
         "angles",
     ),
     _planar("grid", "search on a grid: the published baseline", each(_planar_methods.grid)),

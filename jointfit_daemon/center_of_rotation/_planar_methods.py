@@ -64,7 +64,7 @@ def running(p: Array, _: Movement) -> CenterEstimate:
     return replace(stream.estimate(), method="running_circle")
 
 
-def oriented(p: Array, movement: Movement) -> CenterEstimate:
+def fit_oriented(p: Array, movement: Movement) -> CenterEstimate:
     """Fit the path of one marker together with the child's angle."""
     angles = cast("Array", movement.angles)  # `METHODS` requires the angles for this method
     return oriented_estimate(p, angles, movement.interval, limits=LIMITS)

@@ -112,7 +112,7 @@ def _check_names(table: ChainTable) -> Iterator[Fault]:
     for name, times in Counter(joint.name for joint in table.joint).items():
         parents = [joint.parent for joint in table.joint if joint.name == name]
         if times > 1:
-            text = f"has {times} parents ({_listed(parents)}), expected one [[chain.joint]] with it"
+            text = f"has {times} parents ({_join(parents)}), expected one [[chain.joint]] with it"
             yield Fault(_KEY, text, name)
     for joint in table.joint:
         key = f"{_KEY}[{joint.name}]"
@@ -143,7 +143,7 @@ def _check_connection(table: ChainTable) -> Iterator[Fault]:
     connected = [name for name in roots if name in used]
     if len(connected) > 1:
         text = (
-            f"have no proximal joint: {_listed(connected)}; expected one such segment (the root): "
+            f"have no proximal joint: {_join(connected)}; expected one such segment (the root): "
             "name the others as child of a joint"
         )
         loose = [joint.child for joint in table.joint if joint.child not in table.segments]
@@ -168,7 +168,7 @@ def _check_shape(table: ChainTable) -> Iterator[Fault]:
     root = _roots(table)[0]
     for segment in table.segments:
         names = [joint.name for joint in table.joint if joint.parent == segment]
-        found = f"segment {segment!r} carries {len(names)} joints ({_listed(names) or 'none'})"
+        found = f"segment {segment!r} carries {len(names)} joints ({_join(names) or 'none'})"
         if segment == root and len(names) != _BRANCHES:
             text = "expected a right and a left one; a limb without branches has the key `joints`"
             yield Fault(_KEY, f"{found}, {text}")
@@ -186,7 +186,7 @@ def _check_sides(table: ChainTable) -> Iterator[Fault]:
     root = _roots(table)[0]
     first = [joint for joint in table.joint if joint.parent == root]
     if sorted(str(joint.side) for joint in first) != ["left", "right"]:
-        found = _listed([f"{joint.name}: {joint.side or 'no side'}" for joint in first])
+        found = _join([f"{joint.name}: {joint.side or 'no side'}" for joint in first])
         text = f'expected side = "right" and side = "left" on the joints of {root!r}, found {found}'
         yield Fault(_KEY, text)
     carried = {joint.child: joint for joint in table.joint if joint.child is not None}
@@ -198,5 +198,5 @@ def _check_sides(table: ChainTable) -> Iterator[Fault]:
                 yield Fault(f"{_KEY}[{joint.name}].side", text, joint.side)
 
 
-def _listed(names: Sequence[str]) -> str:
+def _join(names: Sequence[str]) -> str:
     return ", ".join(names)

@@ -119,7 +119,7 @@ def check_chain(table: ChainTable) -> Iterator[Fault]:
         for name in names or ():
             yield from check_topic_name(f"chain.{key}", name)
         if key != "joint":
-            yield from _repeated(f"chain.{key}", names or ())
+            yield from _find_repetitions(f"chain.{key}", names or ())
 
     found = [len(names) for names in (table.joints, table.segments) if names]
     if len(found) == 2 and found[0] != found[1] + 1:  # noqa: PLR2004 - both could be read
@@ -197,7 +197,7 @@ def check_known_name(
     return [Fault(key, f"unknown {what}; known: {choices}", name, near)]
 
 
-def _repeated(key: str, names: Iterable[str]) -> Iterator[Fault]:
+def _find_repetitions(key: str, names: Iterable[str]) -> Iterator[Fault]:
     for name, times in Counter(names).items():
         if times > 1:
             yield Fault(key, f"named {times} times, expected once", name)
@@ -206,7 +206,7 @@ def _repeated(key: str, names: Iterable[str]) -> Iterator[Fault]:
 def check_sensors(imus: Sequence[Mapping[str, Any]], table: ChainTable | None) -> Iterator[Fault]:
     """Check the ids and segments of all readable ``[[imu]]`` tables."""
     ids = [imu["id"] for imu in imus if isinstance(imu.get("id"), str)]
-    yield from _repeated("imu.id", ids)
+    yield from _find_repetitions("imu.id", ids)
     for name in dict.fromkeys(ids):
         yield from check_topic_name(f"imu[{name}].id", name)
         if name == MOCAP:
@@ -250,7 +250,7 @@ def check_markers(settings: MocapSettings, table: ChainTable | None) -> Iterator
     readable = {part: names for part, names in given["markers"].items() if names is not None}
     for part, names in readable.items():
         key = f"mocap.markers.{part}"
-        yield from _repeated(key, names)
+        yield from _find_repetitions(key, names)
         planar = table is not None and table.motion == "planar"
         if not planar and len(set(names)) < _LEAST_MARKERS:
             yield Fault(key, "expected at least three different markers", list(names))

@@ -111,19 +111,19 @@ def _fault(detail: ErrorDetails, model: type[BaseModel], key: str) -> Fault:
             known = f"unknown key; known here: {', '.join(fields)}"
             return Fault(path, known, detail["input"], nearest_key(loc[-1], fields))
         case "missing":
-            about = _described(fields, loc[-1])
+            about = _description_of(fields, loc[-1])
             return Fault(path, f"missing; {about}" if about else "missing: expected a value")
         case "literal_error":
             choices = str(detail["ctx"]["expected"])
             words = choices.replace("'", "").replace(" or ", ", ").split(", ")
-            about = _described(fields, loc[-1])
+            about = _description_of(fields, loc[-1])
             expected = f"expected {choices}" + (f" ({about})" if about else "")
             return Fault(path, expected, detail["input"], nearest_name(detail["input"], words))
         case "model_type" | "model_attributes_type" | "dict_type":
             return Fault(path, f"expected a table{_example(model, loc)}", detail["input"])
         case _:
             name = next((part for part in reversed(loc) if part in fields), loc[-1] if loc else "")
-            why = f" ({about})" if (about := _described(fields, name)) else ""
+            why = f" ({about})" if (about := _description_of(fields, name)) else ""
             text = detail["msg"].removeprefix("Value error, ").removeprefix("Input ")
             expected = f"{text[:1].lower()}{text[1:]}{why}"
             # A check of a whole table names the keys; the printed table itself would be truncated.
@@ -147,7 +147,7 @@ def join(key: str, loc: Sequence[int | str]) -> str:
     return key + "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc)
 
 
-def _described(fields: Mapping[str, Any], name: object) -> str:
+def _description_of(fields: Mapping[str, Any], name: object) -> str:
     field = fields.get(str(name))
     return str(field.description or "") if field is not None else ""
 

@@ -144,7 +144,7 @@ class _Repair:
         for _ in range(_MOST_REPEATED):
             error = _error_of(text := "\n".join(self.lines))
             if error is None:
-                return self._merged(parse_toml(text))
+                return self._merge_tables(parse_toml(text))
             self._remove_repeated(*error)
         return None
 
@@ -214,7 +214,7 @@ class _Repair:
                 self.lines[at] = "[[imu]]"
                 self._report(at, "one table of several: write [[imu]]")
 
-    def _merged(self, table: dict[str, Any]) -> dict[str, Any]:
+    def _merge_tables(self, table: dict[str, Any]) -> dict[str, Any]:
         """Return the table, with keys of repeated tables moved into the first of these tables."""
         unnamed = {name: table.pop(name) for name in [*table] if name.startswith(UNREADABLE)}
         for name, path in self._repeated.items():

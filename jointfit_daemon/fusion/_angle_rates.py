@@ -60,13 +60,13 @@ class AngleRates:
             return None
         per_s = 1e9 / (t_ns - start_ns)
         return JointAngles(
-            _wrapped(angles.flexion - start.flexion) * per_s,
-            _wrapped(angles.adduction - start.adduction) * per_s,
-            _wrapped(angles.rotation - start.rotation) * per_s,
+            _wrap(angles.flexion - start.flexion) * per_s,
+            _wrap(angles.adduction - start.adduction) * per_s,
+            _wrap(angles.rotation - start.rotation) * per_s,
         )
 
 
-def _wrapped(angle: float) -> float:
+def _wrap(angle: float) -> float:
     if -pi < angle < pi:
         return angle
     return angle - 2.0 * pi * round(angle / (2.0 * pi))

@@ -168,7 +168,7 @@ class SegmentFuser:
             self._start_model_fade(t_ns, alive, near, inputs)
         prediction = self._predict(alive, near, inputs)
         self._change_sensors(t_ns, alive, near, inputs, prediction.q)
-        q = self._blended(t_ns, inputs, prediction.q)
+        q = self._blend_sets(t_ns, inputs, prediction.q)
 
         sd = self._with_heading_sd(t_ns, prediction.sd)
         flexion_sd = None if prediction.axis_sd is None else max(prediction.axis_sd[0], MIN_SD)
@@ -231,7 +231,7 @@ class SegmentFuser:
         self._use(old)
         prediction = self._predict(alive, near, inputs).q
         self._change_sensors(t_ns, alive, near, inputs, prediction)
-        output = self._blended(t_ns, inputs, prediction)
+        output = self._blend_sets(t_ns, inputs, prediction)
         self._use(new)
         offset = difference_one(self._predict(alive, near, inputs).q, output)
         self._stop_fading()
@@ -280,7 +280,7 @@ class SegmentFuser:
         self._blends.clear()
         self._history.clear()
 
-    def _blended(self, t_ns: int, inputs: Inputs, target: Quaternion) -> Quaternion:
+    def _blend_sets(self, t_ns: int, inputs: Inputs, target: Quaternion) -> Quaternion:
         """Return the output, blended from the sets of sensors that are faded out to `target`."""
         if self._blends:
             done = [k for k, one in enumerate(self._blends, 1) if t_ns - one.start_ns >= FADE_NS]
@@ -288,15 +288,15 @@ class SegmentFuser:
                 del self._blends[: done[-1]]
                 self._fading = None
         if not self._blends:
-            return self._faded(t_ns, target)
+            return self._fade_to(t_ns, target)
 
         sets = [self._predict(one.alive, one.near, inputs).q for one in self._blends]
-        q = self._faded(t_ns, sets[0])
+        q = self._fade_to(t_ns, sets[0])
         for one, following in zip(self._blends, [*sets[1:], target], strict=True):
             q = interpolate_one(q, following, (t_ns - one.start_ns) / FADE_NS)
         return q
 
-    def _faded(self, t_ns: int, target: Quaternion) -> Quaternion:
+    def _fade_to(self, t_ns: int, target: Quaternion) -> Quaternion:
         if self._fading is None:
             return target
         start_ns, length_ns, (x, y, z) = self._fading

@@ -164,7 +164,7 @@ def coordinate_table(
         free = sum(s.joint.kind == "free" for s in model.segments[:i])
         is_free = segment.joint.kind == "free"
         origin = state.origins[:, free] if is_free else np.zeros((len(state), 3))
-        found, G, left = _inverted(joint, state.rotations[:, i], origin, is_free=is_free)
+        found, G, left = _invert_joint(joint, state.rotations[:, i], origin, is_free=is_free)
         values.append(_continuous(found, joint.is_angle, determined))
 
         # a step has one angle for a hinge, three rotations for a ball joint, and six values for a
@@ -183,7 +183,7 @@ def coordinate_table(
     )
 
 
-def _inverted(
+def _invert_joint(
     joint: JointCoordinates, A: Array, origin: Array, *, is_free: bool
 ) -> tuple[Array, Array, float]:
     """Return the values, shape (T, k), the derivative G, (T, 3 or 6, k), and the misfit, rad."""

@@ -141,7 +141,7 @@ def _flexion(w: float, x: float, y: float, z: float, sign: float) -> JointReadin
 
     gimbal = abs(r02) > GIMBAL_SINE
     if gimbal:
-        phi, psi = _wrapped_one(2.0 * atan2(x, w)), 0.0
+        phi, psi = _wrap_one(2.0 * atan2(x, w)), 0.0
     else:
         phi = atan2(minus_r12, r22)
         psi = atan2(2.0 * (w * z - x * y), 1.0 - 2.0 * (y * y + z * z))
@@ -181,8 +181,8 @@ def _elevation(w: float, x: float, y: float, z: float) -> JointReading:
     if gimbal:
         plane, rotated = 0.0, 2.0 * (half_sum if twist > swing else -half_difference)
     else:
-        plane, rotated = _wrapped_one(half_sum + half_difference), half_sum - half_difference
-    angles = JointAngles(plane, elevation, _wrapped_one(rotated))
+        plane, rotated = _wrap_one(half_sum + half_difference), half_sum - half_difference
+    angles = JointAngles(plane, elevation, _wrap_one(rotated))
     return JointReading(angles, pi - elevation, gimbal, 1.0)
 
 
@@ -204,7 +204,7 @@ def _tilt_torsion(w: float, x: float, y: float, z: float, sign: float) -> JointR
     gimbal = twist < swing and 2.0 * swing * twist < LOCKED_SINE
     c, s = (1.0, 0.0) if gimbal else (w / twist, z / twist)
     v_x, v_y = scale * (x * c - y * s), scale * (x * s + y * c)
-    torsion = 0.0 if gimbal else _wrapped_one(2.0 * atan2(z, w))
+    torsion = 0.0 if gimbal else _wrap_one(2.0 * atan2(z, w))
     angles = JointAngles(sign * v_x, v_y, torsion)
     if gimbal or swing <= _SMALL_TILT:
         return JointReading(angles, pi - tilt, gimbal, inf if gimbal else 1.0)
@@ -245,7 +245,7 @@ def read_patent(q_proximal: Quaternion, q_distal: Quaternion) -> PatentReading:
 
     gimbal = abs(sine) > GIMBAL_SINE
     if gimbal:
-        alpha, gamma = _wrapped_one(2.0 * atan2(x, w)), 0.0
+        alpha, gamma = _wrap_one(2.0 * atan2(x, w)), 0.0
     else:
         alpha = atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
         gamma = atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
@@ -254,5 +254,5 @@ def read_patent(q_proximal: Quaternion, q_distal: Quaternion) -> PatentReading:
     return PatentReading(alpha, beta, gamma, pi - abs(alpha), gimbal)
 
 
-def _wrapped_one(angle: float) -> float:
+def _wrap_one(angle: float) -> float:
     return pi - (pi - angle) % (2.0 * pi)

@@ -48,16 +48,16 @@ def chain_fingerprint(model: ChainModel) -> str:
     Weights, locks and limits do not change the meaning of a position and are excluded.
     """
     joints = [
-        (s.name, s.parent, s.joint.kind, *_rounded(
+        (s.name, s.parent, s.joint.kind, *_round_values(
             (*s.joint.center_in_parent, *s.joint.center, *s.joint.axis, *s.joint.rest),
             *s.joint.path,
         ))
         for s in model.segments
     ]  # fmt: skip
-    markers = [(m.name, m.segment, *_rounded(m.position)) for m in model.markers]
+    markers = [(m.name, m.segment, *_round_values(m.position)) for m in model.markers]
     return sha256(repr((joints, markers)).encode()).hexdigest()
 
 
-def _rounded(*rows: tuple[float, ...]) -> list[float]:
+def _round_values(*rows: tuple[float, ...]) -> list[float]:
     """Return all numbers, rounded, in one list, with 0 instead of -0."""
     return [float(value) for row in rows for value in np.round(row, _DIGITS) + 0.0]

@@ -65,7 +65,7 @@ class SensorLink:
     training.
     """
 
-    def expected(self, up_a: Vector, up_near: Vector | None) -> tuple[tuple[float, ...], float]:
+    def predict(self, up_a: Vector, up_near: Vector | None) -> tuple[tuple[float, ...], float]:
         """Return the expected components in a posture and their standard deviation, rad.
 
         Parameters

@@ -4,13 +4,13 @@ Invariant: the result of a test depends only on the received chunks. Live and re
 same chunks have the same result.
 """
 
-from jointfit_daemon.physical_test._frame_judgement import explain_frames, fit_frames
+from jointfit_daemon.physical_test._frame_evaluation import explain_frames, fit_frames
 from jointfit_daemon.physical_test._outcome_lines import ROTATIONS, correction_lines
 from jointfit_daemon.physical_test._physical_test import (
     STEPS,
     PhysicalTest,
     PhysicalTestResult,
-    judge_recording,
+    evaluate_recording,
 )
 from jointfit_daemon.physical_test._rest_finder import RestFinder
 
@@ -21,7 +21,7 @@ __all__ = [
     "PhysicalTestResult",
     "RestFinder",
     "correction_lines",
+    "evaluate_recording",
     "explain_frames",
     "fit_frames",
-    "judge_recording",
 ]

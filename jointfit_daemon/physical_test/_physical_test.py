@@ -14,7 +14,7 @@ import numpy as np
 
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.model import ImuSample
-from jointfit_daemon.physical_test._frame_judgement import explain_frames, fit_frames
+from jointfit_daemon.physical_test._frame_evaluation import explain_frames, fit_frames
 from jointfit_daemon.physical_test._rest_finder import RestFinder
 
 if TYPE_CHECKING:
@@ -100,10 +100,10 @@ class PhysicalTest:
 
     def result(self) -> PhysicalTestResult:
         """Evaluate the complete test, which decodes all chunks several times."""
-        return judge_recording(self.source, self._chunks, self.rests)
+        return evaluate_recording(self.source, self._chunks, self.rests)
 
 
-def judge_recording(
+def evaluate_recording(
     source: Source, chunks: Sequence[Chunk], rests: Sequence[tuple[int, int]]
 ) -> PhysicalTestResult:
     """Evaluate a recorded test, and find the settings that fit the test.

@@ -249,7 +249,7 @@ class Core:
         self._session.lags = self._lags
         self._mocap.set_calibration(rig.chain, usable)
         self._lag_ns = dict(calibration.lag_ns) if calibration is not None else {}
-        self._lag_ns |= self._lags.known_ns()
+        self._lag_ns |= self._lags.known_lags_ns()
         self._comparison = OpticalComparison(rig.chain, usable, rig.mqtt.optical_hz)
         self._usable = usable
         rate_hz = rig.mqtt.sensors_hz

@@ -113,12 +113,12 @@ class MovingCenters:
         self._latest.append((self._compare(t_ns, centers, live, fit), fit))
         if len(self._latest) < len(self._segments):
             return []
-        found = tuple(self._placed(centers, one, fit) for one, fit in self._latest)
+        found = tuple(self._add_positions(centers, one, fit) for one, fit in self._latest)
         self._latest = []
         return [RunningCenters(t_ns, self._memory_s, found)]
 
     @staticmethod
-    def _placed(
+    def _add_positions(
         centers: LiveJointCenters, found: RunningCenter, fit: CenterEstimate | None
     ) -> RunningCenter:
         """Add the joint's position, which follows from the markers in the newest frame."""

@@ -77,7 +77,7 @@ class _SourceReporter:
             self._deliver(SourceOpened(chunk.t_ns, self._source))
         self._deliver(ChunkArrived(self._source, chunk))
 
-    def closed(
+    def report_end(
         self, reason: Literal["lost", "misconfigured"], text: str, *, absent: bool = False
     ) -> None:
         """Report the end of the source, unless it is the same as the last report.
@@ -91,7 +91,7 @@ class _SourceReporter:
             self._reported = text
         self._open, self._absent = False, absent
 
-    def removed(self) -> None:
+    def report_removal(self) -> None:
         """Report the removal of the source if it was open."""
         if self._open:
             self._deliver(SourceClosed(time.monotonic_ns(), self._source, "removed", "stopped"))
@@ -152,14 +152,14 @@ async def run_source(
         except DeviceMisconfiguredError as wrong:
             misconfigured, text = True, f"{wrong} ({retried})"
         except asyncio.CancelledError:
-            reporter.removed()
+            reporter.report_removal()
             raise
 
         if reporter.worked:
             delay_s, pause_s = FIRST_RETRY_S, first_pause_s
         # The core logs the fault. The text does not contain the duration of the pause, so that a
         # repeated fault has the same text.
-        reporter.closed("misconfigured" if misconfigured else "lost", text, absent=absent)
+        reporter.report_end("misconfigured" if misconfigured else "lost", text, absent=absent)
         if misconfigured:
             state.paused = True
             await _wait_for_change(path, device, pause_s)
@@ -262,7 +262,7 @@ class SourceTasks:
             await stop([removed.task])
         self._run(name, removed.source)
 
-    async def known(self, within_s: float) -> None:
+    async def wait_until_known(self, within_s: float) -> None:
         """Wait until every source has sent a chunk or was reported absent; at most `within_s`."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(within_s):

@@ -173,7 +173,7 @@ class Daemon:
 
     async def _move_to_broker(self, before: Rig, rig: Rig) -> None:
         """Disconnect from the old broker, and send all retained messages to the new one."""
-        await self._link.emptied(FAREWELL_S)  # includes messages that clear a topic
+        await self._link.flush(FAREWELL_S)  # includes messages that clear a topic
         await stop([self._mqtt])
         known = self._outbox.retained
         self._core.unsubscribe(self._topics)
@@ -202,7 +202,7 @@ class Daemon:
                     self._systemd.stopping()
                     self._calibrations.stop()
                     await self._sources.stop()
-                    await self._link.emptied(FAREWELL_S)  # includes "offline" of the devices
+                    await self._link.flush(FAREWELL_S)  # includes "offline" of the devices
         finally:
             logging.getLogger().removeHandler(warnings)
             loop.remove_signal_handler(signal.SIGHUP)
@@ -232,11 +232,11 @@ class Daemon:
         await self._sources.apply(self._rig.sources)
 
         gc.freeze()  # permanent objects are excluded, because scanning them takes milliseconds
-        log.info("%s: running, %s", self._rig.name, _counted(self._rig.sources))
+        log.info("%s: running, %s", self._rig.name, _count_text(self._rig.sources))
         tasks.create_task(self._notify_when_ready(), name="ready")
 
     async def _notify_when_ready(self) -> None:
-        await self._sources.known(KNOWN_S)
+        await self._sources.wait_until_known(KNOWN_S)
         self._publish_health()
         self._systemd.ready()
 
@@ -469,7 +469,7 @@ class Daemon:
                 moves = before_move is not None and rig.mqtt != self._rig.mqtt
                 if before_move is not None and moves:
                     before_move(rig)
-                    await self._link.emptied(FAREWELL_S)
+                    await self._link.flush(FAREWELL_S)
                 await self._change_to(rig)
             except ConfigError as fault:
                 text = f"refused, the running configuration stays in force: {fault}"
@@ -506,10 +506,10 @@ class Daemon:
         self._configure(rig)
         await self._check_state()
         await self._sources.apply(rig.sources)
-        log.info("%s: reloaded, %s", rig.name, _counted(rig.sources))
+        log.info("%s: reloaded, %s", rig.name, _count_text(rig.sources))
 
 
-def _counted(sources: Sequence[Source]) -> str:
+def _count_text(sources: Sequence[Source]) -> str:
     return f"{len(sources)} source{'' if len(sources) == 1 else 's'}"
 
 

@@ -94,7 +94,7 @@ def make_private(directory: Path) -> None:
 
     Only files of this user in the daemon's folders are changed.
     """
-    for path in _written(directory):
+    for path in _owned_paths(directory):
         try:
             found = path.lstat()
             shared = found.st_mode & PRIVATE_UMASK and not found.st_mode & S_ISVTX
@@ -104,7 +104,7 @@ def make_private(directory: Path) -> None:
             continue  # read-only or absent: `write_fault` reports it
 
 
-def _written(directory: Path) -> Iterator[Path]:
+def _owned_paths(directory: Path) -> Iterator[Path]:
     """Yield the directory, and the files and folders in it that daemons wrote, without links."""
     for name in _OWNED:
         for folder, _, files in os.walk(directory / name):

@@ -113,7 +113,7 @@ class Simulator(ChildProcess):
                 if line.get("ready"):
                     return line
 
-    async def say(self, command: str) -> None:
+    async def send_command(self, command: str) -> None:
         """Send a command."""
         if self.process is None or self.process.stdin is None:
             return
@@ -133,7 +133,7 @@ class Simulator(ChildProcess):
 
     async def quit(self) -> dict[str, Any]:
         """Stop the streams; return the number of samples sent."""
-        await self.say("quit")
+        await self.send_command("quit")
         async with time_limit(STOP_S, "the end of the simulator"):
             while True:
                 line = await self.answer()

@@ -113,7 +113,7 @@ class OrientationGate:
         return self._last
 
     @property
-    def judged(self) -> bool:
+    def is_decided(self) -> bool:
         """Whether enough samples were checked, so that `misconfigured_norm` is final."""
         return self._checked >= _CHECKED
 

@@ -182,18 +182,18 @@ def content_text(measurement: Any) -> str:
     """Return the orientation of a sample, or all values of another measurement, as text."""
     if not isinstance(measurement, ImuSample):
         return repr(measurement)
-    return f"q_world_sensor = {_rounded(measurement.q_world_sensor)}"
+    return f"q_world_sensor = {_round_values(measurement.q_world_sensor)}"
 
 
 def expected_text(measurement: Any, number: int) -> str:
     """Return the expected value of sample `number` as text for an error message."""
     if not isinstance(measurement, ImuSample):
         return f", expected number {number}"
-    text = _rounded(orientation(number))
+    text = _round_values(orientation(number))
     return f", expected {text}: check the order of the components, the world and the direction"
 
 
-def _rounded(q: Quaternion) -> str:
+def _round_values(q: Quaternion) -> str:
     return f"({', '.join(f'{part:.3f}' for part in q)})"
 
 

@@ -241,7 +241,7 @@ class DriverContract(ABC):
         """On a busy host, the arrival of a message is computed from the bytes behind it."""
 
         async def scene() -> None:
-            driver, data, t_ns, _ = await self._recorded(tmp_path)
+            driver, data, t_ns, _ = await self._record(tmp_path)
             byte_ns = _BITS * _NS / (self.baud or _NS)
 
             # The same bytes arrive twice: one by one at the line speed, and in one chunk.
@@ -275,7 +275,7 @@ class DriverContract(ABC):
         """The decoder discards an incomplete message after a long silence."""
 
         async def scene() -> None:
-            driver, data, t_ns, whole = await self._recorded(tmp_path)
+            driver, data, t_ns, whole = await self._record(tmp_path)
 
             again = DecodingReceiver(driver, self.measurement)
             again.emit(Chunk(t_ns, data[:-_INCOMPLETE]))
@@ -499,7 +499,7 @@ class DriverContract(ABC):
         async with serve_device(device), self._reading(device, driver, 0) as state:
             yield state
 
-    async def _recorded(self, tmp_path: Path) -> tuple[Driver, bytes, int, list[Any]]:
+    async def _record(self, tmp_path: Path) -> tuple[Driver, bytes, int, list[Any]]:
         """Record a short time; return driver, bytes, time of the last chunk, and measurements."""
         if self.make_driver(tmp_path).wire != "stream" or self.baud is None:
             raise SkipTest("bytes of this wire take no time")

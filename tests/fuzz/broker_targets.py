@@ -22,7 +22,7 @@ from jointfit_daemon.config import MqttSettings, load_rig, parse_rig
 from jointfit_daemon.config._fault_messages import ConfigError
 from jointfit_daemon.model import Chunk
 from jointfit_daemon.outputs.mqtt import Incoming, Outbox
-from jointfit_daemon.outputs.mqtt._signature import signed
+from jointfit_daemon.outputs.mqtt._signature import sign_request
 from jointfit_daemon.outputs.payloads import TopicWriter
 from jointfit_daemon.outputs.recording import (
     RecordingError,
@@ -116,7 +116,7 @@ def seeds_request() -> list[bytes]:
     """Return requests that are valid, signed, unknown, nested and wrong."""
     calibrate = {"phase": "static", "seconds": 3.0, "force": True, "transaction": "a"}
     now_us = time.time_ns() // 1000
-    with_key = signed(
+    with_key = sign_request(
         KEY, TOPIC + "calibrate", {"phase": "abort", "t_us": now_us, "nonce": "n" * 16}
     )
     payloads = [calibrate, {"phase": "abort"}, {"phase": 5, "x": [[[]]]}, with_key]

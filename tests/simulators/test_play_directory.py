@@ -147,9 +147,9 @@ async def test_motion_follows_the_phase_published_by_the_daemon(tmp_path: Path) 
             await listener.client.request("calibrate", {"phase": "abort"})
             assert await motion() == "stand"
             async with asyncio.timeout(PATIENCE_S):  # a motion starts with the next block
-                await simulator.say("status")
+                await simulator.send_command("status")
                 while await motion() != "stand":
-                    await simulator.say("status")
+                    await simulator.send_command("status")
 
 
 @pytest.mark.parametrize("limb", LIMBS)

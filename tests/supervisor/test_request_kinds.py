@@ -15,7 +15,7 @@ import orjson
 import pytest
 
 from jointfit_daemon.config import Rig, parse_rig
-from jointfit_daemon.outputs.mqtt import Incoming, signed
+from jointfit_daemon.outputs.mqtt import Incoming, sign_request
 from jointfit_daemon.outputs.payload_models import ANSWERS
 from jointfit_daemon.outputs.recording import open_recording
 from jointfit_daemon.pipeline.events import (
@@ -157,7 +157,7 @@ async def test_expired_and_unsigned_requests_change_nothing(gateway: Running) ->
         before = gateway.state()
         for name, arguments in VALID.items():
             topic = f"{BASE}/bridge/request/{name}"
-            forged = signed(b"another key, long enough", topic, arguments)
+            forged = sign_request(b"another key, long enough", topic, arguments)
             reply = await gateway.ask(name, arguments)
             assert reply.error is not None
             assert "signed requests only" in str(reply.error["message"])
@@ -166,7 +166,7 @@ async def test_expired_and_unsigned_requests_change_nothing(gateway: Running) ->
             assert "made with another key" in str(reply.error["message"])
         assert gateway.state() == before
 
-        right = signed(b"k" * 32, f"{BASE}/bridge/request/mark", {"text": "a"})
+        right = sign_request(b"k" * 32, f"{BASE}/bridge/request/mark", {"text": "a"})
         assert (await gateway.ask("mark", right)).status == "ok"
         assert "nonce: used already" in str((await gateway.ask("mark", right)).error)
 

@@ -96,7 +96,7 @@ async def sources() -> Any:
 async def test_sources_are_known_once_each_sent_a_chunk_or_failed(
     sources: SourceTasks,
 ) -> None:
-    waiting = asyncio.create_task(sources.known(10.0))
+    waiting = asyncio.create_task(sources.wait_until_known(10.0))
     for go in GO.values():
         await asyncio.sleep(0.02)
         assert not waiting.done()
@@ -109,5 +109,5 @@ async def test_silent_source_is_awaited_for_a_limited_time(sources: SourceTasks)
     GO["well"].set()
     loop = asyncio.get_running_loop()
     began = loop.time()
-    await sources.known(0.1)
+    await sources.wait_until_known(0.1)
     assert 0.09 < loop.time() - began < 2.0

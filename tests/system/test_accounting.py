@@ -36,9 +36,9 @@ async def wait_for_samples(listener: Listener, count: int) -> None:
 
 
 async def replug(simulator: Simulator, listener: Listener, wire: str, *sensors: str) -> None:
-    await simulator.say(f"unplug {wire}")
+    await simulator.send_command(f"unplug {wire}")
     await listener.disconnected(sensors)
-    await simulator.say(f"plug {wire}")
+    await simulator.send_command(f"plug {wire}")
     await listener.connected(sensors)
 
 

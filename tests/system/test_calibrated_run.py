@@ -117,16 +117,16 @@ async def calibrate(simulator: Simulator, listener: Listener) -> None:
     for motion, phase, seconds in (
         ("plate", "align", 8.0), ("stand", "static", 3.0), ("functional", "functional", 12.0),
     ):  # fmt: skip
-        await simulator.say(f"play {motion}")
+        await simulator.send_command(f"play {motion}")
         await asyncio.sleep(SETTLE_S)
         await listener.phase(phase, seconds)
 
 
 async def reconnect(simulator: Simulator, listener: Listener, name: str) -> None:
-    await simulator.say(f"unplug {name}")
+    await simulator.send_command(f"unplug {name}")
     await listener.disconnected({name})
     await asyncio.sleep(0.5)
-    await simulator.say(f"plug {name}")
+    await simulator.send_command(f"plug {name}")
     await listener.connected({name})
     await listener.more_poses(30)
 

@@ -187,10 +187,10 @@ async def turn_a_sensor(page: OpenedPage, simulator: Simulator) -> None:
             turns = await page.page.locator(".turn").all_inner_texts()
             if set(turns) == {"not turned"}:
                 break
-    await simulator.say("slip S1 90")
+    await simulator.send_command("slip S1 90")
     await page.page.wait_for_function(TURNED_BY, arg=["S1", 90], timeout=30_000)
     await page.picture("axes-turned")
-    await simulator.say("slip S1 -90")
+    await simulator.send_command("slip S1 -90")
     await page.page.wait_for_function(TURNED_BY, arg=["S1", 0], timeout=30_000)
 
 
@@ -290,10 +290,10 @@ async def test_a_rig_is_calibrated_in_the_page_and_survives_daemon_and_broker(
                     commands = [e.command for e in recorded if isinstance(e, Request)]
                     assert commands == ["mark"]
                     await revert(page)
-                    await simulator.say("play stand")
+                    await simulator.send_command("play stand")
                     await turn_a_sensor(page, simulator)
                     await use_the_requests(page)
-                    await simulator.say("play walk")
+                    await simulator.send_command("play walk")
                     await photograph(browser, url)
                     assert daemon.process is not None
                     daemon.process.send_signal(signal.SIGKILL)

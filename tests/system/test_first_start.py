@@ -87,7 +87,7 @@ async def test_init_leads_to_angles_on_the_dashboard_within_three_minutes(
                 init.stdin.write(f"{(matching or [''])[0]}\n".encode())
             if turn := re.search(r"Turn the sensor (\w+)-front", line):
                 sensor = {"thigh": "S1", "shank": "S3"}[turn[1]]
-                await device.say(f"slip {sensor} 80")
+                await device.send_command(f"slip {sensor} 80")
         assert await init.wait() == 0, "".join(shown)
         steps.done("jointfit init, two sensors by movement")
 

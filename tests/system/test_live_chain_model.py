@@ -52,9 +52,9 @@ async def lose_and_exchange_markers(
         found: list[str] = listener.latest["optical/chain"]["flags"]
         return found
 
-    await simulator.say("play walk")
-    await simulator.say("hide F2")
-    await simulator.say("exchange T1 T3")
+    await simulator.send_command("play walk")
+    await simulator.send_command("hide F2")
+    await simulator.send_command("exchange T1 T3")
     await listener.until(lambda: {"lost:F2", "exchanged:T1~T3"} <= set(flags()))
     await listener.event("T1", "T1 and T3 look exchanged")
 
@@ -68,8 +68,8 @@ async def lose_and_exchange_markers(
     await listener.until(lambda: is_later_with_both(listener.latest["optical/chain"]))
     faulty = listener.latest["optical/chain"]
 
-    await simulator.say("show F2")
-    await simulator.say("exchange T1 T3")
+    await simulator.send_command("show F2")
+    await simulator.send_command("exchange T1 T3")
     await listener.until(lambda: not flags())
     await listener.event("T1", "in use")
     return faulty, listener.latest["optical/chain"]

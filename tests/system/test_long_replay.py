@@ -49,7 +49,7 @@ async def test_a_long_run_is_replayed_byte_for_byte(tmp_path: Path, broker: Brok
         await reload(station, daemon, listener)
         number = 0
         while time.monotonic() - began < RUN_S:
-            await simulator.say(f"play {('walk', 'squat', 'sit_to_stand')[number % 3]}")
+            await simulator.send_command(f"play {('walk', 'squat', 'sit_to_stand')[number % 3]}")
             await asyncio.sleep(MOTION_S)
             number += 1
         code, _ = await stopped(daemon)

@@ -27,9 +27,9 @@ async def test_joints_of_a_planar_movement_without_sensors(tmp_path: Path, broke
         await wait_for_small_errors(listener)
         figures = [await next_figure(listener) for _ in range(60)]  # several times an occlusion
 
-        await simulator.say("hide T4")
+        await simulator.send_command("hide T4")
         await listener.until(lambda: only_the_hip_lacks(listener, "thigh: T4 not visible"))
-        await simulator.say("show T4")
+        await simulator.send_command("show T4")
         await listener.until(lambda: joints(listener)["hip"]["p_m"] is not None)
 
         answer = await listener.client.request("calibrate", {"phase": "static"})

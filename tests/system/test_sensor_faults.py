@@ -62,7 +62,7 @@ async def wait_for_state(
             and event["t_us"] >= began_us
         ]
 
-    await simulator.say(command)
+    await simulator.send_command(command)
     await listener.until(matching)
     t_us = matching()[0]["t_us"]
     return (t_us - began_us) / SECOND_US, await listener.poses_after(t_us, 50)

@@ -39,7 +39,7 @@ OUTPUT_HZ = 100
 async def send_for_all(simulator: Simulator, command: str) -> None:
     """Send a command of the simulator for every wire."""
     for wire in WIRES:
-        await simulator.say(f"{command} {wire}")
+        await simulator.send_command(f"{command} {wire}")
 
 
 def silent_flags(pose: dict[str, Any]) -> list[str]:
@@ -110,7 +110,7 @@ async def test_poses_continue_as_held_then_lost_while_all_imus_are_silent(
             assert restarts == [0, 0, 0, 0], listener.format_events()
             assert not [e for e in listener.events if "then the static pose" in e["text"]]
 
-            await simulator.say("reboot S1")
+            await simulator.send_command("reboot S1")
             await listener.event("S1", "then the static pose")
             await listener.health(lambda d: d["S1"]["restarts"] == 1)
             await simulator.quit()

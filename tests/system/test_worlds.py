@@ -40,7 +40,7 @@ ASSUMED = "headings_from_static"
 class SpoiledScene(Scene):
     """Simulated devices whose cameras send NaN for some markers in every fifth frame."""
 
-    async def say(self, line: str) -> None:
+    async def send_command(self, line: str) -> None:
         self.command(line)
 
     def spoil(self) -> None:
@@ -69,7 +69,7 @@ async def playing(folder: Path, port: int) -> AsyncIterator[SpoiledScene]:
 async def record_phase(
     simulator: SpoiledScene, listener: Listener, motion: str, *phase: Any
 ) -> Any:
-    await simulator.say(f"play {motion}")
+    await simulator.send_command(f"play {motion}")
     await asyncio.sleep(SETTLE_S)
     return await listener.phase(*phase, force=True)
 
@@ -85,9 +85,9 @@ async def functional(simulator: SpoiledScene, listener: Listener) -> Any:
 
 async def occlude(simulator: SpoiledScene, after_s: float) -> None:
     await asyncio.sleep(after_s)
-    await simulator.say("occlude on")
+    await simulator.send_command("occlude on")
     await asyncio.sleep(1.0)
-    await simulator.say("occlude off")
+    await simulator.send_command("occlude off")
 
 
 async def pose_after(listener: Listener, status: Any) -> dict[str, Any]:
@@ -139,6 +139,6 @@ async def calibrate_twice(station: Station, simulator: SpoiledScene) -> None:
         await record_phase(simulator, listener, "stand", "static", 3.0)
         status = await functional(simulator, listener)
         assert ASSUMED not in (await pose_after(listener, status))["flags"]
-        await simulator.say("play squat")
+        await simulator.send_command("play squat")
         await asyncio.sleep(SETTLE_S)
         assert await knee_error_deg(listener, station.folder) < 2.0

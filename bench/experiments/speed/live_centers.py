@@ -37,7 +37,7 @@ def _feed(frames: list[MocapFrame]) -> Callable[[], object]:
     for i, frame in enumerate(frames[: 4 * EVERY]):  # the estimators have converged
         one.add_mocap(frame)
         if i % EVERY == 0:
-            one.look({}, 1.0)
+            one.update({}, 1.0)
 
     def run() -> None:
         for frame in frames:
@@ -50,7 +50,7 @@ def _look(frames: list[MocapFrame]) -> Callable[[], object]:
     one = _guide()
     for frame in frames:
         one.add_mocap(frame)
-    return lambda: [one.look({}, 10.0) for _ in range(LOOKS)]
+    return lambda: [one.update({}, 10.0) for _ in range(LOOKS)]
 
 
 def rows(quick: bool) -> list[Result]:

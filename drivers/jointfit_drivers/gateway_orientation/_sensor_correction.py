@@ -45,17 +45,17 @@ class SensorCorrection:
         """Return a corrected reading; without `field`, its magnetic field is already correct."""
         magnetic = reading.magnetic
         if field and magnetic is not None:
-            magnetic = _mapped(magnetic, *self._field)
-        force = _mapped(reading.force, *self._force)
-        rate = _mapped(reading.rate, *self._rate)
+            magnetic = _map_vector(magnetic, *self._field)
+        force = _map_vector(reading.force, *self._force)
+        rate = _map_vector(reading.rate, *self._rate)
         return reading._replace(rate=rate, force=force, magnetic=magnetic)
 
     def correct_field(self, field: Vector) -> Vector:
         """Return a corrected magnetic field."""
-        return _mapped(field, *self._field)
+        return _map_vector(field, *self._field)
 
 
-def _mapped(vector: Vector, bias: Vector, matrix: Rows) -> Vector:
+def _map_vector(vector: Vector, bias: Vector, matrix: Rows) -> Vector:
     x, y, z = vector[0] - bias[0], vector[1] - bias[1], vector[2] - bias[2]
     (a, b, c), (d, e, f), (g, h, i) = matrix
     return (a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z)

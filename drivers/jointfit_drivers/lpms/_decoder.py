@@ -202,7 +202,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
         command, data = message.command, message.data
         part = decode_configuration(self._table, command, data)
         if part is not None:
-            self._configuration = self._configuration.updated(part)
+            self._configuration = self._configuration.merge(part)
             mask, rate_hz, floats = self._configuration
             if part.outputs is not None:
                 self._layout = PacketLayout(self._table, part.outputs)

@@ -142,7 +142,7 @@ class LpmsHandshake:
             data = await self._conversation.read(command)
             part = None if data is None else decode_configuration(self._table, command, data)
             if part is not None:
-                found = found.updated(part)
+                found = found.merge(part)
         if found.outputs is None or found.rate_hz is None:
             raise DeviceLostError(
                 f"{self._path}: does not answer the reads of generation {self._table.generation}: "

@@ -76,9 +76,9 @@ def stream_layout(description: StreamDescription, settings: LslMarkersSettings) 
     """
     warnings: list[str] = []
     if settings.names:
-        found = _named(description, settings.names, warnings)
+        found = _named_channels(description, settings.names, warnings)
     else:
-        found = _described(description.channels, warnings)
+        found = _described_channels(description.channels, warnings)
         if not description.channels:
             warnings.append(
                 f"the stream describes none of its {description.channel_count} channels: set names "
@@ -126,7 +126,9 @@ _Found = dict[tuple[str, str, bool], dict[str, int]]
 """Channel number of each component, by owner, name, and whether the owner is an object."""
 
 
-def _named(description: StreamDescription, names: tuple[str, ...], warnings: list[str]) -> _Found:
+def _named_channels(
+    description: StreamDescription, names: tuple[str, ...], warnings: list[str]
+) -> _Found:
     """Return the channels of a stream whose names rig.toml defines."""
     if 3 * len(names) != description.channel_count:
         warnings.append(
@@ -140,7 +142,7 @@ def _named(description: StreamDescription, names: tuple[str, ...], warnings: lis
     }
 
 
-def _described(channels: tuple[Channel, ...], warnings: list[str]) -> _Found:
+def _described_channels(channels: tuple[Channel, ...], warnings: list[str]) -> _Found:
     """Return the channels according to their descriptions in the stream."""
     found: _Found = {}
     repeated: list[str] = []

@@ -105,7 +105,7 @@ class LslMarkersDecoder:
                 case CorruptBytes():
                     out.append(Corrupt(message.discarded, message.reason))
                 case _:
-                    self._described(message, out)
+                    self._bind_channels(message, out)
         self.unpublished = self._codec.undescribed
         return out
 
@@ -115,7 +115,7 @@ class LslMarkersDecoder:
 
     # --- description --------------------------------------------------------------------------
 
-    def _described(self, description: StreamDescription, out: list[Decoded]) -> None:
+    def _bind_channels(self, description: StreamDescription, out: list[Decoded]) -> None:
         """Assign the channels of a new connection to the names in rig.toml."""
         before, self._description = self._description, description
         layout = stream_layout(description, self._settings)

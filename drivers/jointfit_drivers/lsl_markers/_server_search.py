@@ -55,10 +55,10 @@ def _search(lsl: Any, hosts: Sequence[str], broadcast: bool, wait_s: float) -> l
         # The search always takes its full duration, because any number of streams may answer.
         for info in search_streams(lsl, query, server, least=_MOST_STREAMS, wait_s=wait_s):
             found[info.uid()] = info
-    return [_described(lsl, info, wait_s) for info in found.values()]
+    return [_describe_server(lsl, info, wait_s) for info in found.values()]
 
 
-def _described(lsl: Any, info: Any, wait_s: float) -> FoundServer:
+def _describe_server(lsl: Any, info: Any, wait_s: float) -> FoundServer:
     """Return the description of a stream, with the names of its markers and bodies."""
     markers: tuple[str, ...] = ()
     bodies: tuple[str, ...] = ()

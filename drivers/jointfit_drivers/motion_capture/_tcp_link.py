@@ -56,7 +56,7 @@ class TcpLink(SocketLink):
                 route.host, port, local=route.local, within_s=CONNECT_S
             )
         except OSError as error:
-            raise self._lost(error) from error
+            raise self._lost_error(error) from error
         self._connection = connection
 
         def read() -> None:
@@ -67,7 +67,7 @@ class TcpLink(SocketLink):
                         return
                     self._take(segment)
             except OSError as error:
-                raise self._lost(error) from error
+                raise self._lost_error(error) from error
 
         self.watch(connection, read)
 
@@ -84,9 +84,9 @@ class TcpLink(SocketLink):
         try:
             self._connection.send(data)
         except OSError as error:
-            raise self._lost(error) from error
+            raise self._lost_error(error) from error
 
-    def _lost(self, error: OSError) -> DeviceLostError:
+    def _lost_error(self, error: OSError) -> DeviceLostError:
         if isinstance(error, ConnectionRefusedError):
             text = f"no program listens on this TCP port: {self._remedy}"
         elif isinstance(error, ConnectionResetError):

@@ -17,8 +17,8 @@ from jointfit_protocols.natnet import (
     FrameOfData,
     NatNetMessageId,
     decode,
+    is_supported,
     is_versioned,
-    supported,
 )
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class BitstreamTracker:
     def announce(self, version: Version) -> None:
         """Process the version in a SERVERINFO. The first is used; later versions are candidates."""
         self._announced = version
-        if not self.known or not supported(self.version):
+        if not self.known or not is_supported(self.version):
             self.version = version
 
     def confirm(self, version: Version) -> None:

@@ -178,7 +178,7 @@ class NatNetDecoder:
             self._continuity.forget()
             out.append(DeviceEvent("restart", f"another server answers: {info.application}"))
 
-        if not natnet.supported(info.bitstream):
+        if not natnet.is_supported(info.bitstream):
             name = "{}.{}".format(*info.bitstream)
             text = f"the server uses NatNet {name}, 2.5 or newer is required"
             out.append(DeviceEvent("error", text, {"bitstream": name}))

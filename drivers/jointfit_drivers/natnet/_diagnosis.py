@@ -115,12 +115,12 @@ async def diagnose(settings: NatNetSettings, wait_s: float) -> list[Finding]:
     if reception.frames:
         return [*findings, *_stream_findings(settings, reception)]
     if "natnet" not in reception.facts:
-        return [*findings, _unanswered(settings, reception.failure)]
+        return [*findings, _unanswered_finding(settings, reception.failure)]
     missing = await _missing_frames(settings, Route(host, local), reception)
     return [*findings, *missing]
 
 
-def _unanswered(settings: NatNetSettings, failure: Exception | None) -> Finding:
+def _unanswered_finding(settings: NatNetSettings, failure: Exception | None) -> Finding:
     """Return the finding for a server that does not answer CONNECT."""
     name, port = settings.server, settings.command_port
     if isinstance(failure, DeviceMisconfiguredError):

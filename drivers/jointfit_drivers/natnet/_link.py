@@ -84,16 +84,16 @@ class NatNetLink(SocketLink):
         try:
             self._command.send(encode(message), self._server)
         except OSError as error:
-            if error.errno not in _FLEETING and not self._forged(error):
-                raise self._lost(error) from error
+            if error.errno not in _FLEETING and not self._is_forged(error):
+                raise self._lost_error(error) from error
 
     def _read(self, source: UdpSocket) -> None:
         try:
             arrivals = source.receive()
         except OSError as error:
-            if self._forged(error):
+            if self._is_forged(error):
                 return
-            raise self._lost(error) from error
+            raise self._lost_error(error) from error
 
         for arrival in arrivals:
             is_command = source is self._command and arrival.port == self._server[1]
@@ -104,12 +104,12 @@ class NatNetLink(SocketLink):
             self._received_ns = arrival.t_ns
             self._take(Chunk(arrival.t_ns, arrival.data))
 
-    def _forged(self, error: OSError) -> bool:
+    def _is_forged(self, error: OSError) -> bool:
         """Return whether an ICMP refusal contradicts datagrams that have just arrived."""
         recent = time.monotonic_ns() - self._received_ns < _FORGED_NS
         return recent and isinstance(error, ConnectionRefusedError)
 
-    def _lost(self, error: OSError) -> DeviceLostError:
+    def _lost_error(self, error: OSError) -> DeviceLostError:
         host, port = self._server
         if isinstance(error, ConnectionRefusedError):
             text = "no program listens on this port: start Motive and switch streaming on"

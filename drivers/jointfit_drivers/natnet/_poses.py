@@ -67,7 +67,7 @@ class PoseConverter:
         unknown: list[int] = []
 
         place = self._place
-        seen, errors = self._labeled(frame, binding.known, unknown)
+        seen, errors = self._labeled_markers(frame, binding.known, unknown)
         for asset in frame.assets:
             for number, x, y, z, _, params, _ in asset.markers:
                 if params & _QUALITY_BITS == MARKER_POINT_CLOUD_SOLVED and is_near(x, y, z):
@@ -93,7 +93,7 @@ class PoseConverter:
             tuple(unknown),
         )
 
-    def _labeled(
+    def _labeled_markers(
         self, frame: FrameOfData, known: frozenset[ColumnKey], unknown: list[int]
     ) -> tuple[dict[ColumnKey, Vector], dict[ColumnKey, float]]:
         """Return positions and residuals of the usable labeled markers."""

@@ -9,7 +9,7 @@ from ipaddress import IPv4Address
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.driver import DeviceMisconfiguredError
-from jointfit_protocols.natnet import OLDEST, TICKED, Connect, supported
+from jointfit_protocols.natnet import OLDEST, TICKED, Connect, is_supported
 
 if TYPE_CHECKING:
     from jointfit_drivers.natnet._settings import NatNetSettings
@@ -56,7 +56,7 @@ def check_server(name: str, settings: NatNetSettings, info: ServerInfo) -> None:
         The server is too old or too new, has no clock, or cannot change its bitstream in multicast.
     """
     found = f"{name} ({info.application}) uses NatNet {info.bitstream[0]}.{info.bitstream[1]}"
-    if not supported(info.bitstream):
+    if not is_supported(info.bitstream):
         raise DeviceMisconfiguredError(
             f"{found}; {OLDEST[0]}.{OLDEST[1]} or newer is required: update Motive to 1.5 or later"
         )

@@ -89,7 +89,7 @@ async def _ask_host(local: str, address: str, port: int, wait_s: float) -> list[
         transport.sendto(natnet.encode(natnet.Bare(NatNetMessageId.DISCONNECT)), server)
     finally:
         transport.close()
-    return _found(local, answers)
+    return _found_servers(local, answers)
 
 
 async def _ask_network(local: str, address: str, port: int, wait_s: float) -> list[FoundServer]:
@@ -104,10 +104,10 @@ async def _ask_network(local: str, address: str, port: int, wait_s: float) -> li
             await asyncio.sleep(wait_s / _TRIES)
     finally:
         transport.close()
-    return _found(local, answers)
+    return _found_servers(local, answers)
 
 
-def _found(local: str, answers: _Answers) -> list[FoundServer]:
+def _found_servers(local: str, answers: _Answers) -> list[FoundServer]:
     found = []
     for address, info in answers.servers.items():
         model = answers.models.get(address)

@@ -143,7 +143,7 @@ class SerialPort:
         try:
             termios.tcflush(self._fd, termios.TCIFLUSH)
         except termios.error as error:
-            raise _unplugged(self.path, error.args[-1]) from error
+            raise _unplugged_error(self.path, error.args[-1]) from error
 
     async def pump(self, emit: Callable[[Chunk], None], silence_s: float | None) -> None:
         """Pass every chunk to `emit` until cancelled.
@@ -230,9 +230,9 @@ class SerialPort:
                 except BlockingIOError:
                     return
                 except OSError as error:
-                    raise _unplugged(path, error.strerror) from error
+                    raise _unplugged_error(path, error.strerror) from error
                 if not data:  # end of file: the system has closed the port
-                    raise _unplugged(path, "hang-up")  # noqa: TRY301 - a call costs a tenth of all
+                    raise _unplugged_error(path, "hang-up")  # noqa: TRY301 - a call costs a tenth of all
 
                 # The stamp must follow the read. A stamp from before the read would be too early
                 # for bytes that arrive while this process is delayed, and clocks are fitted to the
@@ -272,10 +272,10 @@ class SerialPort:
                 finally:
                     loop.remove_writer(fd)
             except OSError as error:
-                raise _unplugged(self.path, error.strerror) from error
+                raise _unplugged_error(self.path, error.strerror) from error
 
 
-def _unplugged(path: str, found: object) -> DeviceAbsentError:
+def _unplugged_error(path: str, found: object) -> DeviceAbsentError:
     return DeviceAbsentError(f"{path}: unplugged ({found}): plug it in again, or check its cable")
 
 

@@ -40,7 +40,7 @@ def explain_bytes(data: bytes, wire: FrameFormat | LineFormat) -> str:
     """Return why `data` contain no message of the format `wire`, with the key to change."""
     is_text = sum(32 <= byte < 127 or byte in b"\r\n\t" for byte in data) >= _PRINTABLE * len(data)  # noqa: PLR2004 - ASCII
     if isinstance(wire, LineFormat):
-        return _explain_lines(data, wire) if is_text else _NOT_TEXT.format(_shown(data))
+        return _explain_lines(data, wire) if is_text else _NOT_TEXT.format(_hex_text(data))
     if is_text:
         return f"they are text, such as {data[:_SHOWN]!r}: describe it with `text`, not `frame`"
     return _explain_frames(data, wire)
@@ -88,7 +88,7 @@ def _explain_frames(data: bytes, wire: FrameFormat) -> str:
     sync = wire.sync.hex(" ").upper()
     starts = [found.start() for found in re.finditer(b"(?=" + re.escape(wire.sync) + b")", data)]
     if len(starts) < _FEW:
-        shown = _shown(data)
+        shown = _hex_text(data)
         return f"sync bytes {sync} hardly occur in {shown}: check `baud` and `frame.sync`"
 
     distances = Counter(after - before for before, after in pairwise(starts))
@@ -106,7 +106,7 @@ def _explain_frames(data: bytes, wire: FrameFormat) -> str:
         usual = _usual_checksums(len(wire.sync)) if len(frames) >= _FEW else ()
         fits = (one for one in usual if all(_is_valid(frame, one, wire) for frame in frames))
         fitting = next(fits, None)
-        known = "" if fitting is None else f"; the data fit {_described(fitting)}"
+        known = "" if fitting is None else f"; the data fit {_checksum_keys(fitting)}"
         return (
             f"no checksum of frames with {spacing} bytes is valid{known}: correct `frame.checksum`"
         )
@@ -168,7 +168,7 @@ def _usual_checksums(sync: int) -> Iterator[Checksum]:
                     yield base._replace(reflected=True)
 
 
-def _described(checksum: Checksum) -> str:
+def _checksum_keys(checksum: Checksum) -> str:
     """Return the keys of a checksum whose values differ from the defaults."""
     plain = Checksum(checksum.kind)
     keys = [f'kind = "{checksum.kind}"']
@@ -181,7 +181,7 @@ def _described(checksum: Checksum) -> str:
     return ", ".join(keys)
 
 
-def _shown(data: bytes) -> str:
+def _hex_text(data: bytes) -> str:
     return data[:_SHOWN].hex(" ").upper()
 
 

@@ -113,7 +113,7 @@ class RecordContinuity:
         """Return the number of samples from `last` to `point`; None if they do not follow."""
         c = self._count(last, point)
         if last.ticks is None or point.ticks is None:
-            return self._counted(c, point.arrival_ns - last.arrival_ns)
+            return self._count_by_counter(c, point.arrival_ns - last.arrival_ns)
 
         d = point.ticks - last.ticks
         if self._modulus is not None:
@@ -154,7 +154,7 @@ class RecordContinuity:
         step = point.counter - last.counter
         return step if self._counts is None else step % self._counts
 
-    def _counted(self, c: int | None, elapsed_ns: int) -> int | None:
+    def _count_by_counter(self, c: int | None, elapsed_ns: int) -> int | None:
         """Return the number of samples according to the counter alone."""
         if c is None:
             return 1

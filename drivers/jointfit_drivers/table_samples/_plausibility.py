@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Vector
     from jointfit_protocols.table import Quantity
 
-_JUDGED = 100
+_CHECKED = 100
 """Number of records after which scale and byte order are checked."""
 _ROUND = 0.05
 """Largest deviation of the median norm of quaternions from 1."""
@@ -70,8 +70,8 @@ class PlausibilityChecks:
             # All components are known, because a record without measurements is not passed here.
             values = cast("tuple[float, ...]", record.values)
             self._samples.append((record.data, values, si))
-            if len(self._samples) >= _JUDGED:
-                out += self._judge(self._samples)
+            if len(self._samples) >= _CHECKED:
+                out += self._check_norms(self._samples)
                 self._samples = None
         if not self._time_done and ticks is not None:
             out += self._check_time(ticks, record.arrival_ns)
@@ -83,7 +83,7 @@ class PlausibilityChecks:
         """Start the check of device time again, because the device restarted."""
         self._first, self._timed = None, 0
 
-    def _judge(self, samples: Sequence[_Sample]) -> list[DeviceEvent]:
+    def _check_norms(self, samples: Sequence[_Sample]) -> list[DeviceEvent]:
         """Return warnings about the quantities whose norm is wrong."""
         checks: dict[Quantity, tuple[Callable[[float], bool], float]] = {
             "quaternion": (lambda norm: abs(norm - 1) <= _ROUND, _GOOD),

@@ -108,13 +108,13 @@ class RecordSamples(Refusals):
         if step.held:
             return out
         if held is not None and step.confirmed:
-            out += self._confirmed(held, restarted=step.restarted)
+            out += self._confirm(held, restarted=step.restarted)
         lost = step.lost_since if step.confirmed else step.lost
         if lost:
             out.append(_gap(lost))
         return out + self._sample(record, ticks, counter)
 
-    def _confirmed(self, held: TableRecord, *, restarted: bool) -> list[Decoded]:
+    def _confirm(self, held: TableRecord, *, restarted: bool) -> list[Decoded]:
         """Return the sample of the held record, after the next record confirmed it."""
         ticks = self._ticks(held.values)
         out: list[Decoded] = []
@@ -142,7 +142,7 @@ class RecordSamples(Refusals):
         si = self._si(record.values)
         status = None if self._valid is None else int(record.values[self._valid] or 0)
         if self._raw is not None:
-            return self._oriented(
+            return self._orient(
                 self._raw,
                 record,
                 si,
@@ -169,7 +169,7 @@ class RecordSamples(Refusals):
         )
         return [ImuSample(record.arrival_ns, q, native, ticks, counter, status, *vectors)]
 
-    def _oriented(
+    def _orient(
         self, raw: RawSamples, record: TableRecord, si: tuple[float, ...], stamp: RawStamp
     ) -> list[Decoded]:
         """Return samples for which the gateway computes the orientation."""

@@ -94,7 +94,7 @@ def place_fields(
             key = f"fields.{name}" + (f"[{at}]" if len(parts) > 1 else "")
             try:
                 order = _order(name, part, letters)
-                placed = [_scaled(name, part, each) for each in place(name, part, len(order))]
+                placed = [_scale_field(name, part, each) for each in place(name, part, len(order))]
             except FieldFaultError as fault:
                 form.faults.append((f"{key}.{fault.name}".rstrip("."), fault.text))
                 continue
@@ -286,7 +286,7 @@ def _order(name: Quantity, part: FieldSettings, letters: str) -> str:
     return part.order
 
 
-def _scaled(name: Quantity, part: FieldSettings, place: TableField) -> TableField:
+def _scale_field(name: Quantity, part: FieldSettings, place: TableField) -> TableField:
     """Return the position with a scale that converts to SI units."""
     if part.scale is not None and part.divisor is not None:
         raise FieldFaultError("divisor", "expected either `scale` or `divisor`")

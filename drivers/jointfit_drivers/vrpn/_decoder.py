@@ -179,7 +179,7 @@ class VrpnDecoder:
             self._first_us = frame.time_us
         if not self._settled and frame.time_us - self._first_us >= _SETTLED_US:
             self._settled = self._stale_binding = True
-        binding = self._bound(out)
+        binding = self._bind(out)
 
         poses: dict[ColumnKey, tuple[Vector, Quaternion | None]] = {}
         scale = self._scale
@@ -232,7 +232,7 @@ class VrpnDecoder:
 
     # --- names --------------------------------------------------------------------------------
 
-    def _bound(self, out: list[Decoded]) -> ColumnBinding:
+    def _bind(self, out: list[Decoded]) -> ColumnBinding:
         """Return the columns, which change after a new name; append the events of changes."""
         before = self._binding
         if before is not None and not self._stale_binding:

@@ -78,13 +78,13 @@ class VrpnLink(SocketLink):
         try:
             self._connection.send(data)
         except OSError as error:
-            raise self._lost(error) from error
+            raise self._lost_error(error) from error
 
     def _read_tcp(self) -> None:
         try:
             segment = self._connection.receive()
         except OSError as error:
-            raise self._lost(error) from error
+            raise self._lost_error(error) from error
         if segment is None:
             return
         data = self._pending + segment.data if self._pending else segment.data
@@ -99,14 +99,14 @@ class VrpnLink(SocketLink):
         except ConnectionRefusedError:  # forged: this socket sends nothing
             return
         except OSError as error:
-            raise self._lost(error) from error
+            raise self._lost_error(error) from error
         for arrival in arrivals:
             if arrival.host == host and is_whole(arrival.data):
                 self._take(Chunk(arrival.t_ns, arrival.data))
             else:
                 self.foreign += 1
 
-    def _lost(self, error: OSError) -> DeviceLostError:
+    def _lost_error(self, error: OSError) -> DeviceLostError:
         return DeviceLostError(
             f"{self._name}: {error.strerror or error}: check network cable and network card, and "
             "that the camera software runs"

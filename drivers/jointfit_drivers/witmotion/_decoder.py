@@ -173,7 +173,7 @@ class WitMotionDecoder:
         ]
 
         # Warn once if hardly any quaternion has the norm 1.
-        if not self._norm_checked and self._gate.judged:
+        if not self._norm_checked and self._gate.is_decided:
             self._norm_checked, norm = True, self._gate.misconfigured_norm
             if norm is not None:
                 text = f"median quaternion norm is {norm:.4g}, expected 1: the scale is wrong"

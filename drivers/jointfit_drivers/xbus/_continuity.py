@@ -163,7 +163,7 @@ class XbusContinuity:
         if counts and ticks and counts <= _DISTINCT:
             self._sum_ticks += ticks
             self._sum_counts += counts
-        lost = _lost(last, point)
+        lost = _lost_count(last, point)
         return XbusStep(lost) if lost else _CONTINUES
 
     def _classify(self, last: _OrientationPoint, held: _OrientationPoint) -> XbusStep:
@@ -171,12 +171,12 @@ class XbusContinuity:
         ticks, counts = self._ticks(last, held), _counts(last, held)
         if ticks is None:  # without time, only a restart decreases the counter
             fell = counts is not None and counts > _DISTINCT
-            return XbusStep(restarted=True) if fell else XbusStep(_lost(last, held))
+            return XbusStep(restarted=True) if fell else XbusStep(_lost_count(last, held))
 
         plausible = 0 <= ticks <= _PLAUSIBLE_GAP
         if counts is not None and plausible and self._agree(ticks, counts):
             turns = round((ticks / self._period - counts) / _COUNTS)
-            return XbusStep(_lost(last, held) + max(turns, 0) * _COUNTS)
+            return XbusStep(_lost_count(last, held) + max(turns, 0) * _COUNTS)
         if plausible and (counts is None or ticks <= _GAP * self._period):
             return XbusStep(counter_jumped=counts is not None)
         # Some bits of a message may be corrupt, or a backlog may have ended. It is a restart only
@@ -248,7 +248,7 @@ def _counts(last: _OrientationPoint, point: _OrientationPoint) -> int | None:
     return (point.counter - last.counter) % _COUNTS
 
 
-def _lost(last: _OrientationPoint, point: _OrientationPoint) -> int:
+def _lost_count(last: _OrientationPoint, point: _OrientationPoint) -> int:
     """Return the number of messages lost between two points."""
     counts = _counts(last, point)
     if counts is None or counts > _DISTINCT:  # the counter decreased slightly

@@ -322,7 +322,7 @@ class XbusDecoder:
 
         # Warn once if hardly any quaternion has the norm 1.
         if not self._norm_checked:
-            self._norm_checked, norm = self._gate.judged, self._gate.misconfigured_norm
+            self._norm_checked, norm = self._gate.is_decided, self._gate.misconfigured_norm
             if norm is not None:
                 text = f"median quaternion norm is {norm:.4g}, expected 1"
                 text += ": byte order or scale is wrong"

@@ -201,7 +201,7 @@ class XbusHandshake:
         if self._settings.sync is None:
             return
         asked = _sync_lines.sync_entries(self._settings.sync, self._product_code)
-        faults = _sync_lines.sync_differences(await self._sync_stored(), asked)
+        faults = _sync_lines.sync_differences(await self._stored_sync_settings(), asked)
         if not faults:
             return
         self._refuse_to_write(faults)
@@ -212,13 +212,13 @@ class XbusHandshake:
         )
         self._refuse_error(reply, "refuses these sync settings", "`sync`")
 
-        left = _sync_lines.sync_differences(await self._sync_stored(), asked)
+        left = _sync_lines.sync_differences(await self._stored_sync_settings(), asked)
         if left:
             raise DeviceMisconfiguredError(
                 f"{self._path}: does not accept `sync`: {'; '.join(left)}: change `sync`"
             )
 
-    async def _sync_stored(self) -> tuple[setup.SyncSetting, ...]:
+    async def _stored_sync_settings(self) -> tuple[setup.SyncSetting, ...]:
         reply = await self._answer(XbusMessageId.SYNC_SETTINGS)
         self._refuse_error(reply, "has no sync settings", "`sync`: leave it out")
         entries = setup.decode_sync(reply.data) or ()

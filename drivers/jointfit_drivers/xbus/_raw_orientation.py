@@ -68,9 +68,9 @@ class RawOrientation:
         rate, force = values.get(RATES[0]), values.get(FORCES[0])
         if rate is None:
             turn = cast("tuple[float, float, float, float]", values[RATES[1]])
-            rate = _scaled(_rotation_vector(turn), 1.0 / period_s)
+            rate = _scale(_rotation_vector(turn), 1.0 / period_s)
         if force is None:
-            force = _scaled(cast("Vector", values[FORCES[1]]), 1.0 / period_s)
+            force = _scale(cast("Vector", values[FORCES[1]]), 1.0 / period_s)
         field = values.get(FIELD) if self._samples.magnetometer else None
         vectors = (cast("Vector", rate), cast("Vector", force), cast("Vector | None", field))
         reading = RawReading(self._t_ns + passed * TICK_NS, *vectors)
@@ -90,5 +90,5 @@ def _rotation_vector(q: tuple[float, float, float, float]) -> Vector:
     return (scale * x, scale * y, scale * z)
 
 
-def _scaled(vector: Vector, scale: float) -> Vector:
+def _scale(vector: Vector, scale: float) -> Vector:
     return (vector[0] * scale, vector[1] * scale, vector[2] * scale)

@@ -96,7 +96,7 @@ class XcdiDecoder:
                 elif isinstance(message, XcdiError):
                     known = message.code == OVERFLOW
                     text = _OVERFLOWED if known else f"device reports error {message.code}"
-                    out += self._bus.limited("error", text, message.t_ns)
+                    out += self._bus.limit_event("error", text, message.t_ns)
                 elif message is not None:
                     out.append(self._bus.discard(can.RECORD_BYTES, message.reason))
         return out

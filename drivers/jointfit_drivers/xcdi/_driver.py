@@ -57,7 +57,7 @@ class XcdiIdSettings(Settings):
     def contradictions(self) -> Iterator[tuple[str, str]]:
         """Yield identifiers that are equal, or whose order would split the frames of a sample."""
         in_order: tuple[Any, ...] = (self.sample_time, self.group_counter, self.quaternion)
-        ids = self.resolved()._asdict() if None not in in_order else dict(self)
+        ids = self.resolve()._asdict() if None not in in_order else dict(self)
 
         owners: dict[int, str] = {}
         for name in _ID_NAMES:
@@ -79,7 +79,7 @@ class XcdiIdSettings(Settings):
                 "Set all three as in the device",
             )
 
-    def resolved(self, *, extended: bool = False) -> XcdiIds:
+    def resolve(self, *, extended: bool = False) -> XcdiIds:
         """Return all identifiers.
 
         If `status_word` or `error` is omitted, it gets the common offset of the other three
@@ -128,7 +128,7 @@ class XcdiSettings(CanImuSettings):
     @property
     @override
     def can_frames(self) -> tuple[tuple[int, bool], ...]:
-        ids = self.ids.resolved(extended=self.extended_ids)
+        ids = self.ids.resolve(extended=self.extended_ids)
         return tuple(
             (_SAMPLE_BYTES[data_id], extended)
             for (_, extended), data_id in ids.by_id().items()
@@ -175,7 +175,7 @@ class XcdiImu:
 
     def __init__(self, settings: XcdiSettings) -> None:
         self._settings = settings
-        self._ids = settings.ids.resolved(extended=settings.extended_ids)
+        self._ids = settings.ids.resolve(extended=settings.extended_ids)
         self._reception = CanReception(settings, "over UART, Xsens MT Manager")
 
     def decoder(self) -> XcdiDecoder:

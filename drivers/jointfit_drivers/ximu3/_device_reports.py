@@ -56,13 +56,13 @@ class DeviceReports:
         """Return the events that a reply to a command causes."""
         key, value = reply.key, reply.value
         if reply.error is not None:
-            text = f"command {_shown(key)} refused: {_shown(reply.error)}"
+            text = f"command {_text_of(key)} refused: {_text_of(reply.error)}"
             return [DeviceEvent("warning", text, {"command": key, "error": reply.error})]
 
         if key == "ping" and isinstance(value, dict):
             names = {"name": "name", "sn": "serial", "interface": "interface"}
             known: dict[str, object] = {"model": "x-IMU3"}
-            known |= {name: _shown(value[key]) for key, name in names.items() if key in value}
+            known |= {name: _text_of(value[key]) for key, name in names.items() if key in value}
             return _properties(known)
         if key == "ahrs_axes_convention":
             return self._world_events(value)
@@ -76,12 +76,12 @@ class DeviceReports:
                 out.append(DeviceEvent("warning", text, {key: value}))
             return out
         if key in _PROPERTIES:
-            return _properties({_PROPERTIES[key]: _shown(value)})
+            return _properties({_PROPERTIES[key]: _text_of(value)})
         return _properties({key: value} if key in _SETTINGS and isinstance(value, int) else {})
 
     def data_events(self, message: XImu3Data) -> list[Decoded]:
         """Return the events of a data message without measurement; most messages cause none."""
-        text = _shown(message.text.decode("utf-8", "replace"))
+        text = _text_of(message.text.decode("utf-8", "replace"))
         if message.kind == DataKind.ERROR:
             return [DeviceEvent("error", f"device reports: {text}", {"error": text})]
         if message.kind == DataKind.NOTIFICATION:
@@ -100,7 +100,9 @@ class DeviceReports:
 
     def _world_events(self, value: object) -> list[Decoded]:
         if type(value) is not int or not 0 <= value < len(WORLDS):
-            text = f"ahrs_axes_convention is {_shown(value)}, expected 0, 1 or 2: {self.world} kept"
+            text = (
+                f"ahrs_axes_convention is {_text_of(value)}, expected 0, 1 or 2: {self.world} kept"
+            )
             return [DeviceEvent("warning", text)]
         world, before, known = WORLDS[value], self.world, self._world_known
         self.world, self._world_known = world, True
@@ -114,6 +116,6 @@ def _properties(known: dict[str, object]) -> list[Decoded]:
     return [DeviceEvent("info", text, known)] if known else []
 
 
-def _shown(value: object) -> str:
+def _text_of(value: object) -> str:
     """Return a value that the device sent, as text of limited length."""
     return str(value)[:_LONGEST_TEXT]

@@ -20,8 +20,8 @@ from jointfit_daemon.center_of_rotation import BodyPoses, refusal
 from jointfit_daemon.center_of_rotation.spatial import (
     SphereLimits,
     SphereOptions,
+    evaluate_sphere,
     fit_score,
-    judge_sphere,
     objection,
     solve_sphere,
 )
@@ -85,7 +85,7 @@ def fit_center(points: Array, start: Array) -> CenterEstimate:
 
     options = replace(ON_SKIN, start=np.asarray(start, dtype=np.float64))
     fit = solve_sphere(points, options)
-    found = judge_sphere(fit, "sphere", frames, LIMITS, options)
+    found = evaluate_sphere(fit, "sphere", frames, LIMITS, options)
 
     # The leverage is the covariance of the center per variance of the radial residuals.
     lever = fit.basis @ np.linalg.pinv(fit.information / max(float(fit.weights.sum()), 1e-12))

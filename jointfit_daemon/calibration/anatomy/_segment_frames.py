@@ -185,7 +185,7 @@ def find_anatomy(
             x = _mean_axis([axes[joint] for joint in used])
             if not chain.static_axes and shoulders.intersection(used):
                 flags.append(FrameFlag.AXIS_FROM_SHOULDER.of(segment))
-        if x is None and _jointed(chain, tracks):
+        if x is None and _joint_tracks(chain, tracks):
             raise CalibrationError(
                 f"{segment}: no adjacent joint flexed enough to determine its flexion axis; "
                 "flex and extend it (squats)"
@@ -200,7 +200,7 @@ def find_anatomy(
     return Anatomy(joints, q_static, lengths, sources, axes, tuple(flags), tuple(notes))
 
 
-def _jointed(
+def _joint_tracks(
     chain: Chain, tracks: Mapping[str, ClusterTrack]
 ) -> dict[str, tuple[ClusterTrack, ClusterTrack]]:
     """Return the two body parts of every joint with visible markers on both sides."""
@@ -228,7 +228,7 @@ def _fit_centers(
     chain: Chain, tracks: Mapping[str, ClusterTrack], choice: CenterChoice
 ) -> tuple[dict[str, JointCenter | None], list[str]]:
     found: dict[str, CenterEstimate] = {}
-    notes, faults, jointed = [], [], _jointed(chain, tracks)
+    notes, faults, jointed = [], [], _joint_tracks(chain, tracks)
     turned = [choice.turned.get(part) if part else None for part in body_parts(chain)]
     for joint, (above, below) in jointed.items():
         start = (above.origin + below.origin) / 2
@@ -336,9 +336,9 @@ def _with_lengths(
             continue
         top, bottom = chain.joints[i], chain.joints[distal[0]]
         if (known := joints[top]) is not None and joints[bottom] is None:
-            joints[bottom] = _hung(known, -length)
+            joints[bottom] = _place_vertically(known, -length)
         elif (known := joints[bottom]) is not None and joints[top] is None:
-            joints[top] = _hung(known, length)
+            joints[top] = _place_vertically(known, length)
 
     for i in range(len(chain.segments)):
         if len(distal_joints(chain, i)) > 1:
@@ -350,7 +350,7 @@ def _with_lengths(
     return joints
 
 
-def _hung(known: JointCenter, up: float) -> JointCenter:
+def _place_vertically(known: JointCenter, up: float) -> JointCenter:
     wide = known.covariance + CONFIGURED_SD_M**2 * np.eye(3)
     return JointCenter(known.center + up * _UP, wide, "length", None, None)
 
@@ -401,7 +401,7 @@ def _flexion_axes(
     chain: Chain, tracks: Mapping[str, ClusterTrack], z: Sequence[Array]
 ) -> dict[str, FlexionAxis]:
     found = {}
-    for joint, (above, below) in _jointed(chain, tracks).items():
+    for joint, (above, below) in _joint_tracks(chain, tracks).items():
         i = chain.joints.index(joint)
         distal = z[i] if i < len(z) else _UP  # the distal body part has no long axis
         found[joint] = flexion_axis(above, below, distal, flexion_sign(joint))

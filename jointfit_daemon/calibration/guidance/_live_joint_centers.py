@@ -31,7 +31,7 @@ from jointfit_daemon.calibration.anatomy import (
     place_unobserved,
 )
 from jointfit_daemon.calibration.guidance._live_clusters import LiveClusters
-from jointfit_daemon.center_of_rotation.spatial import RunningSphere, centered
+from jointfit_daemon.center_of_rotation.spatial import RunningSphere, center_sums
 from jointfit_daemon.limb_model import body_parts, branch_runs, joint_parts
 
 if TYPE_CHECKING:
@@ -205,7 +205,7 @@ class LiveJointCenters:
         shown, axes, clear = np.zeros((3, 3)), np.eye(3), np.zeros(3, dtype=np.bool_)
         if len(fit.unseen) < 2 and np.isfinite(center).all():
             # The mean square change of the marker directions, rad², shape (3, 3).
-            sums = centered(self._spheres[k].sums())
+            sums = center_sums(self._spheres[k].sums())
             n = sums.weights
             turned = (
                 np.einsum("jajb->jab", sums.M[:, 1:-1, :, 1:-1]) / np.maximum(n, 1.0)[:, None, None]

@@ -117,7 +117,7 @@ class MovementGuide:
         self._centers.feed(frame)
         self._labels.feed(frame)
 
-    def look(self, latest: Mapping[str, Quaternion], elapsed_s: float) -> MovementStatus:
+    def update(self, latest: Mapping[str, Quaternion], elapsed_s: float) -> MovementStatus:
         """Return the current state.
 
         Parameters

@@ -94,8 +94,10 @@ class MovementProgress:
             reach = self._seen.get((joint, a, b))
             if reach is None:
                 zero = self.standing if {a, b} <= self.standing.keys() else latest
-                reach = self._seen[joint, a, b] = _RotationRange(_between(zero[a], zero[b]))
-            reach.take(_between(latest[a], latest[b]))
+                reach = self._seen[joint, a, b] = _RotationRange(
+                    _relative_rotation(zero[a], zero[b])
+                )
+            reach.take(_relative_rotation(latest[a], latest[b]))
 
     def arcs(self) -> dict[str, float]:
         """Return the largest arc of each inner joint since the start, rad."""
@@ -122,5 +124,5 @@ class MovementProgress:
         }
 
 
-def _between(proximal: Quaternion, distal: Quaternion) -> np.ndarray:
+def _relative_rotation(proximal: Quaternion, distal: Quaternion) -> np.ndarray:
     return rotation.multiply(rotation.conjugate(np.asarray(proximal)), np.asarray(distal))

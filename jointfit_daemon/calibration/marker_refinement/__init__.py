@@ -2,7 +2,7 @@
 
 from jointfit_daemon.calibration.marker_refinement._block_descent import Carriers
 from jointfit_daemon.calibration.marker_refinement._coordinate_search import SearchSettings, search
-from jointfit_daemon.calibration.marker_refinement._evaluation import judge_trial
+from jointfit_daemon.calibration.marker_refinement._evaluation import evaluate_trial
 from jointfit_daemon.calibration.marker_refinement._input_checks import (
     MOST_RMS_M,
     exchange_text,
@@ -39,10 +39,10 @@ __all__ = [
     "SearchSettings",
     "TrackingStatistics",
     "TrialOutcome",
+    "evaluate_trial",
     "exchange_text",
     "exchanged_markers",
     "find_trial_faults",
-    "judge_trial",
     "refine_markers",
     "require_marker",
     "search",

@@ -51,7 +51,7 @@ def _mean(square: Array, seen: NDArray[np.bool_], axis: int) -> Array:
     return np.where(counted > 0, total / np.maximum(counted, 1), np.nan)
 
 
-def judge_trial(
+def evaluate_trial(
     before: ChainModel,
     after: ChainModel,
     trial: MotionTrial,
@@ -75,11 +75,13 @@ def judge_trial(
         trial.rate_hz,
         tracking_statistics(old.residuals),
         tracking_statistics(new.residuals),
-        turned(before, old, new),
+        rotation_changes(before, old, new),
     )
 
 
-def turned(model: ChainModel, old: IkResult, new: IkResult) -> dict[str, tuple[float, float]]:
+def rotation_changes(
+    model: ChainModel, old: IkResult, new: IkResult
+) -> dict[str, tuple[float, float]]:
     """Return RMS and greatest rotation of every joint between two solutions, rad, by segment."""
     well = ~(old.underdetermined | new.underdetermined)
     if not well.any():
@@ -101,8 +103,8 @@ def marker_outcomes(
     trials: Sequence[TrialOutcome],
 ) -> tuple[MarkerOutcome, ...]:
     """Return the result of every marker."""
-    old = _pooled([t.before for t in trials], [t.frames for t in trials])
-    new = _pooled([t.after for t in trials], [t.frames for t in trials])
+    old = _pool_errors([t.before for t in trials], [t.frames for t in trials])
+    new = _pool_errors([t.after for t in trials], [t.frames for t in trials])
     moved = after.positions - before.positions
     return tuple(
         MarkerOutcome(m.name, m.segment, tuple(d), tuple(~f), float(a), float(b))
@@ -110,7 +112,7 @@ def marker_outcomes(
     )
 
 
-def _pooled(fits: Sequence[TrackingStatistics], frames: Sequence[int]) -> Array:
+def _pool_errors(fits: Sequence[TrackingStatistics], frames: Sequence[int]) -> Array:
     square = np.array([fit.by_marker**2 for fit in fits])
     seen = np.isfinite(square)
     weight = seen * np.array(frames)[:, None]

@@ -28,7 +28,7 @@ class MotionTrial:
     """Measured marker positions in the world, m, shape (T, M, 3); NaN where missing."""
     rate_hz: float
 
-    def thinned(self, most: int) -> MotionTrial:
+    def thin(self, most: int) -> MotionTrial:
         """Return at most `most` frames, evenly spaced over the whole trial."""
         every = max(1, -(-len(self.targets) // most))
         return MotionTrial(self.name, self.targets[::every], self.rate_hz / every)

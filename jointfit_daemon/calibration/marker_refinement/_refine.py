@@ -13,7 +13,10 @@ import numpy as np
 
 from jointfit_daemon.calibration.marker_refinement._block_descent import Carriers, solve_in_turns
 from jointfit_daemon.calibration.marker_refinement._coordinate_search import search
-from jointfit_daemon.calibration.marker_refinement._evaluation import judge_trial, marker_outcomes
+from jointfit_daemon.calibration.marker_refinement._evaluation import (
+    evaluate_trial,
+    marker_outcomes,
+)
 from jointfit_daemon.calibration.marker_refinement._gauge import Gauge, gauge_of
 from jointfit_daemon.calibration.marker_refinement._input_checks import CheckedTrials, check
 from jointfit_daemon.calibration.marker_refinement._motion_trial import (
@@ -25,7 +28,7 @@ from jointfit_daemon.calibration.marker_refinement._refinement_result import Ref
 from jointfit_daemon.calibration.marker_refinement._simultaneous import (
     linearize,
     place,
-    solve_jointly,
+    solve_simultaneously,
 )
 from jointfit_daemon.kinematics.inverse_kinematics import (
     IkOptions,
@@ -94,8 +97,8 @@ def refine_markers(
     settings = settings or RefinementSettings()
     if settings.cost == "l1" and settings.method == "search":
         raise RefinementError("cost l1: method search has no loss function; use joint or block")
-    thin = [trial.thinned(settings.frames) for trial in trials]
-    unseen = [trial.thinned(settings.frames) for trial in validation]
+    thin = [trial.thin(settings.frames) for trial in trials]
+    unseen = [trial.thin(settings.frames) for trial in validation]
     checked = check(model, thin, unseen)
     task = _task(model, checked, settings)
     control = _RunControl(progress or (lambda _share, _error: None), stop or (lambda: False))
@@ -103,7 +106,7 @@ def refine_markers(
     after = model.with_markers(ended.positions)
     within = IkOptions(limit_m2=settings.limit_m2)
     outcomes = tuple(
-        judge_trial(model, after, t, trained=n < len(thin), options=within)
+        evaluate_trial(model, after, t, trained=n < len(thin), options=within)
         for n, t in enumerate((*checked.trials, *unseen))
     )
 
@@ -221,18 +224,18 @@ class _HoldOut:
         return self._rises >= _RISES
 
 
-def _jointly(
+def _refine_simultaneously(
     task: _RefinementTask, settings: RefinementSettings, control: _RunControl
 ) -> _RefinementEnd:
     problem = task.problem
     start = place(problem, problem.model.positions, task.first.state)
     watch = _StopCriterion(task.holdout, problem, control)
     tolerance = settings.tolerance or 1e-6
-    steps = solve_jointly(problem, start, lambda s: watch(s.positions, s.cost), tolerance)
-    return watch.ended(steps[-1].positions, [s.cost for s in steps], 1)
+    steps = solve_simultaneously(problem, start, lambda s: watch(s.positions, s.cost), tolerance)
+    return watch.finish(steps[-1].positions, [s.cost for s in steps], 1)
 
 
-def _in_turns(
+def _refine_by_blocks(
     task: _RefinementTask, settings: RefinementSettings, control: _RunControl
 ) -> _RefinementEnd:
     problem = task.problem
@@ -242,10 +245,10 @@ def _in_turns(
     turns = solve_in_turns(
         problem, chain, lambda t: watch(t.positions, t.cost), tolerance=tolerance
     )
-    return watch.ended(turns[-1].positions, [t.cost for t in turns], chain.runs)
+    return watch.finish(turns[-1].positions, [t.cost for t in turns], chain.runs)
 
 
-def _searching(
+def _refine_by_search(
     task: _RefinementTask, settings: RefinementSettings, control: _RunControl
 ) -> _RefinementEnd:
     problem, last = task.problem, task.first
@@ -275,7 +278,11 @@ def _searching(
     return _RefinementEnd(found.positions, found.errors, found.runs, stopped)
 
 
-_METHODS = {"joint": _jointly, "block": _in_turns, "search": _searching}
+_METHODS = {
+    "joint": _refine_simultaneously,
+    "block": _refine_by_blocks,
+    "search": _refine_by_search,
+}
 
 
 class ChainFollower:
@@ -315,7 +322,7 @@ class _StopCriterion:
         self._stopped = not self._early and self._control.stop()
         return self._early or self._stopped
 
-    def ended(self, positions: Array, costs: Sequence[float], runs: int) -> _RefinementEnd:
+    def finish(self, positions: Array, costs: Sequence[float], runs: int) -> _RefinementEnd:
         stopped = "the hold-out error rose" if self._early else "converged"
         stopped = STOPPED if self._stopped else stopped
         if self._holdout is not None:

@@ -69,15 +69,15 @@ class NormalEquations:
 
     def solve(self, damping: float) -> tuple[Array, Array]:
         """Return the step of the markers, shape (f,), and of the poses, shape (T, nq)."""
-        solved, S, r = self._reduced(damping)
+        solved, S, r = self._eliminate(damping)
         dp = np.asarray(-np.linalg.solve(S, self.h - r), dtype=np.float64)
         return dp, -(solved[..., -1] + solved[..., :-1] @ dp)
 
     def reduced(self) -> Array:
         """Return S without damping, shape (f, f)."""
-        return self._reduced(0.0)[1]
+        return self._eliminate(0.0)[1]
 
-    def _reduced(self, damping: float) -> tuple[Array, Array, Array]:
+    def _eliminate(self, damping: float) -> tuple[Array, Array, Array]:
         nq = self.A.shape[-1]
         A = self.A + _FLOOR * np.eye(nq)
         A[:, range(nq), range(nq)] += damping * self.A[:, range(nq), range(nq)]
@@ -129,7 +129,7 @@ def linearize(problem: RefinementProblem, positions: Array, state: ChainState) -
     return NormalEquations(A, B, g, h.ravel()[free], C.ravel()[free])
 
 
-def solve_jointly(
+def solve_simultaneously(
     problem: RefinementProblem,
     start: RefinementStep,
     on_step: Callable[[RefinementStep], bool] | None = None,

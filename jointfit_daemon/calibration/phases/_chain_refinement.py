@@ -25,7 +25,7 @@ from jointfit_daemon.calibration.marker_refinement import (
     STOPPED,
     MotionTrial,
     RefinementError,
-    judge_trial,
+    evaluate_trial,
     refine_markers,
 )
 from jointfit_daemon.kinematics.accepted_errors import (
@@ -105,7 +105,7 @@ def refine_chain(
         model, reason = wanted.model.name, str(refusal)
         text = f"chain model {model!r}: markers not refined: {reason}"
         return ChainOutcome(None, ChainQuality(model, wanted.settings.method, reason), (text,))
-    return _outcome(wanted, found, unseen.thinned(wanted.settings.frames))
+    return _outcome(wanted, found, unseen.thin(wanted.settings.frames))
 
 
 def with_refined_chain(
@@ -146,8 +146,8 @@ def _outcome(wanted: ChainRefinement, found: Refinement, unseen: MotionTrial) ->
         for m in np.flatnonzero(far)
     ]
 
-    judge, parts = _select(wanted, found, unseen, refused)
-    figures = _figures(wanted, found, judge, parts, shift)
+    holdout, parts = _select(wanted, found, unseen, refused)
+    figures = _figures(wanted, found, holdout, parts, shift)
     notes += _notes(wanted, found, figures)
     used = {s for s, part in parts.items() if part.refined}
     positions = {m.name: vector(m.position) for m in found.model.markers if m.segment in used}
@@ -166,8 +166,8 @@ def _select(
     model = wanted.model
     shift = found.model.positions - model.positions
     moved = {model.markers[m].segment for m in np.flatnonzero(shift.any(axis=1))}
-    judge = next(trial for trial in found.trials if not trial.trained)
-    errors = _part_errors(model, judge, moved)
+    holdout = next(trial for trial in found.trials if not trial.trained)
+    errors = _part_errors(model, holdout, moved)
     parts = {s: PartQuality(*both, refined=False) for s, both in errors.items()}
 
     used = moved - refused
@@ -176,31 +176,31 @@ def _select(
             selected = np.array([m.segment in used for m in model.markers])
             mixed = model.with_markers(model.positions + shift * selected[:, None])
             within = IkOptions(limit_m2=wanted.settings.limit_m2)
-            judge = judge_trial(model, mixed, unseen, trained=False, options=within)
-        errors = _part_errors(model, judge, used)
+            holdout = evaluate_trial(model, mixed, unseen, trained=False, options=within)
+        errors = _part_errors(model, holdout, used)
         parts |= {s: PartQuality(*both, refined=True) for s, both in errors.items()}
         worse = {s for s, (before, after) in errors.items() if after >= before}
-        if not worse and judge.after.rms >= judge.before.rms:
+        if not worse and holdout.after.rms >= holdout.before.rms:
             worse = used
         if not worse:
-            return judge, parts
+            return holdout, parts
         parts |= {s: replace(parts[s], refined=False) for s in worse}
         used = used - worse
 
 
 def _part_errors(
-    model: ChainModel, judge: TrialOutcome, segments: set[str]
+    model: ChainModel, holdout: TrialOutcome, segments: set[str]
 ) -> dict[str, tuple[float, float]]:
     """Return the RMS error of the markers of each segment before and after, m."""
     names = np.array([m.segment for m in model.markers])
-    before, after = judge.before.by_marker, judge.after.by_marker
+    before, after = holdout.before.by_marker, holdout.after.by_marker
     return {s: (rms(before[names == s], 0.0), rms(after[names == s], 0.0)) for s in segments}
 
 
 def _figures(
     wanted: ChainRefinement,
     found: Refinement,
-    judge: TrialOutcome,
+    holdout: TrialOutcome,
     parts: dict[str, PartQuality],
     shift: Array,
 ) -> ChainQuality:
@@ -213,9 +213,9 @@ def _figures(
         model.name,
         found.method,
         frames=next(trial.frames for trial in found.trials if trial.trained),
-        judged=judge.frames,
-        before=_errors(judge.before.rms, judge.before.maximum),
-        after=_errors(judge.after.rms, judge.after.maximum),
+        judged=holdout.frames,
+        before=_errors(holdout.before.rms, holdout.before.maximum),
+        after=_errors(holdout.after.rms, holdout.after.maximum),
         parts={s: parts[s] for s in model.segment_names if s in parts},
         moved_m={
             m.name: float(np.linalg.norm(shift[k]))
@@ -237,7 +237,7 @@ def _notes(wanted: ChainRefinement, found: Refinement, figures: ChainQuality) ->
     if found.stopped == STOPPED:
         notes.append(
             f"{name}: the refinement was {figures.stopped}, before it converged; the result so far "
-            "was judged. Use fewer frames, another method, or a longer limit_s"
+            "was evaluated. Use fewer frames, another method, or a longer limit_s"
         )
     if found.gauge.fixed_by == "nothing":
         notes.append(

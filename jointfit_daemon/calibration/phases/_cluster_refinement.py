@@ -93,13 +93,13 @@ def refine_clusters(
         return RefinedClusters(clusters, None, (f"markers not refined: {refusal}",))
 
     # Only parts with a smaller held-out error and plausible marker displacements are used.
-    judge = next(trial for trial in found.trials if not trial.trained)
+    holdout = next(trial for trial in found.trials if not trial.trained)
     used, parts = dict(clusters), {}
     moved: dict[str, float] = {}
     notes: list[str] = []
     for i, (name, cluster) in enumerate(marked.items()):
         mine = model.marker_segments == i
-        before, after = (rms(one.by_marker[mine], 0.0) for one in (judge.before, judge.after))
+        before, after = (rms(one.by_marker[mine], 0.0) for one in (holdout.before, holdout.after))
         other = fit_shape_to_pose(cluster, found.model.positions[mine])
         shift = other.template + other.origin - cluster.template - cluster.origin
         lengths = np.linalg.norm(shift, axis=1)

@@ -53,13 +53,13 @@ from jointfit_daemon.calibration.registration import (
 from jointfit_daemon.calibration.soft_tissue import (
     LimbTraining,
     evaluate_methods,
-    evenly,
     fit_links,
     fit_models,
     fit_verified_models,
     joint_error_correlations,
     pack,
     regression_quality,
+    thin_evenly,
 )
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
@@ -172,7 +172,7 @@ def fit_calibration(
         software=software,
         links=fit_links(chain, training.sensors, anatomy.q_static),
         correlations=joint_error_correlations(chain, training, settings.method),
-        memory=pack(chain, evenly(chain, training)) if settings.method == "anchored" else "",
+        memory=pack(chain, thin_evenly(chain, training)) if settings.method == "anchored" else "",
         procedure=settings.procedure,
     )
 

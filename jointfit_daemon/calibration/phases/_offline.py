@@ -213,10 +213,10 @@ def evaluate(
     rows: list[MethodScore] = []
     reference, t_s = {}, {}
     for training, test in folds:
-        judge = _Fold.of(chain, training, test, mounts)
-        rows += judge.singles()
-        rows += [judge.method(method) for method in reversed(methods)]
-        reference[test.name], t_s[test.name] = judge.truth, test.t_s
+        fold = _Fold.of(chain, training, test, mounts)
+        rows += fold.singles()
+        rows += [fold.method(method) for method in reversed(methods)]
+        reference[test.name], t_s[test.name] = fold.truth, test.t_s
     return MethodEvaluation(tuple(rows), reference, t_s, held_out)
 
 

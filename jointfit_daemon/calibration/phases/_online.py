@@ -21,14 +21,14 @@ from jointfit_daemon.calibration._quality import OnlineQuality, quality_table
 from jointfit_daemon.calibration._robust_weights import rms
 from jointfit_daemon.calibration.soft_tissue import (
     LimbTraining,
-    evenly,
     fit_all_sensors,
     fit_models,
     flexion_error,
-    joined,
+    join_training,
     joint_error_correlations,
     pack,
     predict_all_sensors,
+    thin_evenly,
     unpack,
 )
 from jointfit_daemon.kinematics import rotation
@@ -118,7 +118,7 @@ def refit_models(
 
     # The candidate is fitted without the newest frames, and evaluated on these and on earlier
     # frames.
-    training = joined(known, evenly(chain, older))
+    training = join_training(known, thin_evenly(chain, older))
     in_force = _in_force(calibration, chain)
     candidate = {
         name: fit_all_sensors(chain, i, calibration.method, training)
@@ -138,7 +138,7 @@ def refit_models(
         return FitResult({"online": quality_table(figures)}, kept=kept)
 
     # The candidate is accepted. The final models are fitted to all frames, for all sets of sensors.
-    whole = evenly(chain, joined(known, new))
+    whole = thin_evenly(chain, join_training(known, new))
     models = fit_models(chain, whole, calibration.method)
     rounds = int(calibration.quality.get("online", {}).get("rounds", 0)) + 1
     figures = replace(figures, rounds=rounds, software=software, taught=calibration.digest)

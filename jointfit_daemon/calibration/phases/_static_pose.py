@@ -204,7 +204,7 @@ def with_new_static(
             *(f"{name}: no data in the new static pose; switch it on" for name in missing)
         )
 
-    if exchanges := _exchanged(calibration, pose):
+    if exchanges := _label_exchanges(calibration, pose):
         raise CalibrationError(
             *(f"{one.text}; correct the labels and repeat the phase" for one in exchanges)
         )
@@ -215,7 +215,7 @@ def with_new_static(
     for name, segment in calibration.segment.items():
         turned = None
         if calibration.procedure == "corrected":
-            turned = _turned(calibration.clusters.get(name), pose.clusters.get(name))
+            turned = _part_rotation(calibration.clusters.get(name), pose.clusters.get(name))
         assumed |= turned is None and bool(calibration.clusters)
         q = segment.q_static if turned is None else rotation.multiply(turned, segment.q_static)
         q_now[name] = as_quaternion(q)
@@ -244,7 +244,7 @@ def with_new_static(
     return replace(calibration, sensor=sensors, flags=tuple(flags), quality=quality)
 
 
-def _exchanged(calibration: Calibration, pose: StaticPose) -> list[LabelFault]:
+def _label_exchanges(calibration: Calibration, pose: StaticPose) -> list[LabelFault]:
     """Return exchanges of marker labels since the calibration, for parts that do not fit."""
     stored = calibration.clusters
     same = [
@@ -261,7 +261,9 @@ def _exchanged(calibration: Calibration, pose: StaticPose) -> list[LabelFault]:
     return [fault for fault in faults if len(fault.markers) > 1 and wrong & set(fault.parts)]
 
 
-def _turned(old: StoredCluster | None, new: MarkerCluster | None) -> NDArray[np.float64] | None:
+def _part_rotation(
+    old: StoredCluster | None, new: MarkerCluster | None
+) -> NDArray[np.float64] | None:
     """Return the rotation of a body part since its earlier pose; None if not visible."""
     if old is None or new is None or old.markers != new.markers or old.body != new.body:
         return None

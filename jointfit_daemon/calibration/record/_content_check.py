@@ -120,7 +120,7 @@ def _sensors(c: Calibration) -> Iterator[str]:
 
 def _segment(name: str, segment: SegmentCalibration) -> Iterator[str]:
     yield from _unit(f"segment.{name}.q_static", segment.q_static)
-    yield from _bounded(f"segment.{name}", segment, ("length", "length_sd"), _LONGEST_M)
+    yield from _fields_out_of_range(f"segment.{name}", segment, ("length", "length_sd"), _LONGEST_M)
     for key, model in segment.models.items():
         sensors, bar, other = key.partition("|")
         if not bar:
@@ -209,7 +209,9 @@ def _joints(c: Calibration) -> Iterator[str]:
                 yield from _finite(f"{key}.unseen", direction, (3,))
         if not _is_text(joint.source):
             yield f"joint.{name}.source: {joint.source!r}"
-        yield from _bounded(f"joint.{name}", joint, ("sd", "residual_rms", "gap_rms"), _LARGEST_SD)
+        yield from _fields_out_of_range(
+            f"joint.{name}", joint, ("sd", "residual_rms", "gap_rms"), _LARGEST_SD
+        )
 
 
 def _clusters(c: Calibration) -> Iterator[str]:
@@ -264,7 +266,9 @@ def _same(key: str, found: Mapping[str, Any], names: Sequence[str]) -> Iterator[
         yield f"{key}: expected {', '.join(names)}, found {', '.join(found) or 'none'}"
 
 
-def _bounded(key: str, record: object, names: Sequence[str], largest: float) -> Iterator[str]:
+def _fields_out_of_range(
+    key: str, record: object, names: Sequence[str], largest: float
+) -> Iterator[str]:
     """Yield the fields that are neither None nor a number from 0 to `largest`."""
     for name in names:
         if not _number_or_none(value := getattr(record, name), 0.0, largest):

@@ -132,7 +132,7 @@ def fit_sensor_alignment(
 
     if kind == "mount":
         q_mount = robust_mean(rotation.multiply(rotation.conjugate(q_s), q_ref)).q
-        return _judged(kind, (q_s, q_ref), rotation.IDENTITY, q_mount, 0.0)
+        return _alignment_result(kind, (q_s, q_ref), rotation.IDENTITY, q_mount, 0.0)
 
     T = np.swapaxes(rotation.left_matrix(q_s), -1, -2) @ rotation.right_matrix(q_ref)
 
@@ -163,7 +163,7 @@ def _solve(
         q_world, b, kappa = _decompose(kind, T, weights * signs)
         if float(np.max(np.abs(weights * signs - before))) < SETTLED:
             break
-    return _judged(kind, (q_s, q_ref), q_world, b, kappa)
+    return _alignment_result(kind, (q_s, q_ref), q_world, b, kappa)
 
 
 def _decompose(kind: AlignmentKind, T: Array, signed_weights: Array) -> tuple[Array, Array, float]:
@@ -183,7 +183,7 @@ def _model(q_world: Array, q_s: Array, q_mount: Array) -> Array:
     return rotation.multiply(q_world, rotation.multiply(q_s, q_mount))
 
 
-def _judged(
+def _alignment_result(
     kind: AlignmentKind, streams: tuple[Array, Array], q_world: Array, q_mount: Array, kappa: float
 ) -> SensorAlignment:
     q_s, q_ref = streams

@@ -22,7 +22,12 @@ from jointfit_daemon.calibration.soft_tissue._robust_ridge import fit_ridge
 from jointfit_daemon.calibration.soft_tissue._segment_fit import fit_segment
 from jointfit_daemon.calibration.soft_tissue._segment_training import FEWEST_FRAMES, SegmentTraining
 from jointfit_daemon.calibration.soft_tissue._sensor_link_fit import fit_links
-from jointfit_daemon.calibration.soft_tissue._training_memory import evenly, joined, pack, unpack
+from jointfit_daemon.calibration.soft_tissue._training_memory import (
+    join_training,
+    pack,
+    thin_evenly,
+    unpack,
+)
 
 __all__ = [
     "BLOCKS",
@@ -32,7 +37,6 @@ __all__ = [
     "SegmentTraining",
     "error_correlation",
     "evaluate_methods",
-    "evenly",
     "fit_all_sensors",
     "fit_expert",
     "fit_links",
@@ -42,10 +46,11 @@ __all__ = [
     "fit_verified_models",
     "flexion_error",
     "fusion_weights",
-    "joined",
+    "join_training",
     "joint_error_correlations",
     "pack",
     "predict_all_sensors",
     "regression_quality",
+    "thin_evenly",
     "unpack",
 ]

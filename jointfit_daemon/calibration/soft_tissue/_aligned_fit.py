@@ -19,11 +19,11 @@ def fit_aligned(training: SegmentTraining) -> AlignedModel:
     Each sensor is aligned by a robot-world and hand-eye calibration with known verticals
     (`fit_sensor_alignment`). The mean is the eigenvector mean of Markley et al. 2007.
     """
-    sd = held_out_sd(training, lambda part, test: _aligned(part, 0.0).predict(test.sensors))
-    return _aligned(training, sd)
+    sd = held_out_sd(training, lambda part, test: _fit_model(part, 0.0).predict(test.sensors))
+    return _fit_model(training, sd)
 
 
-def _aligned(training: SegmentTraining, sd: float) -> AlignedModel:
+def _fit_model(training: SegmentTraining, sd: float) -> AlignedModel:
     # Each sensor is aligned first. The errors of the aligned sensors then determine the weights.
     found = [fit_sensor_alignment("heading", q, training.q_reference) for q in training.sensors]
     turned = [

@@ -127,13 +127,13 @@ def choose(basis: Basis, rho: Array, groups: Masks) -> HeldOut:
     shares, residuals = [], np.empty_like(rho)
     for axis in range(rho.shape[1]):
         A = predicted[:, :, :, axis].reshape(-1, len(rho)).T
-        found = stacked(A, rho[:, axis])
+        found = stacking_weights(A, rho[:, axis])
         residuals[:, axis] = rho[:, axis] - A @ found
         shares.append(found.reshape(len(RATIOS), len(PENALTIES)))
     return HeldOut(np.array(shares), residuals)
 
 
-def stacked(predictions: Array, y: Array) -> Array:
+def stacking_weights(predictions: Array, y: Array) -> Array:
     """Return shares a >= 0, sum <= 1, that minimize ``|y - predictions @ a|``.
 
     Parameters

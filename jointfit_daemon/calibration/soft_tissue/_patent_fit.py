@@ -25,21 +25,21 @@ def fit_patent(reading: PatentReading, training: SegmentTraining) -> PatentModel
     the condition numbers, which are close to a thousand.
     """
     sd = held_out_sd(
-        training, lambda part, test: _regressed(reading, part, 0.0).predict(test.sensors)
+        training, lambda part, test: _fit_regression(reading, part, 0.0).predict(test.sensors)
     )
-    return _regressed(reading, training, sd)
+    return _fit_regression(reading, training, sd)
 
 
-def _regressed(reading: PatentReading, training: SegmentTraining, sd: float) -> PatentModel:
+def _fit_regression(reading: PatentReading, training: SegmentTraining, sd: float) -> PatentModel:
     q_sign = training.q_reference[0]
     inputs = [rotation.align_hemisphere(q, q_sign) for q in training.sensors]
     target = rotation.align_hemisphere(training.q_reference, q_sign)
-    table = (_separate if reading == "patent12" else _shared)(inputs, target)
+    table = (_solve_separately if reading == "patent12" else _solve_shared)(inputs, target)
     rows = tuple(tuple(row) for row in table.tolist())
     return PatentModel(reading, rows, as_quaternion(q_sign.tolist()), sd, training.movements)
 
 
-def _separate(inputs: list[Array], target: Array) -> Array:
+def _solve_separately(inputs: list[Array], target: Array) -> Array:
     """Fit four separate systems, one per component, with len(inputs) + 1 parameters each."""
     rows = []
     for k in range(4):
@@ -48,7 +48,7 @@ def _separate(inputs: list[Array], target: Array) -> Array:
     return np.array(rows)
 
 
-def _shared(inputs: list[Array], target: Array) -> Array:
+def _solve_shared(inputs: list[Array], target: Array) -> Array:
     """Fit all components together; each sensor has one coefficient, each component an intercept."""
     n, count = len(target), len(inputs)
     A = np.zeros((4 * n, count + 4))

@@ -63,7 +63,7 @@ def unpack(chain: Chain, text: str) -> LimbTraining | None:
     )
 
 
-def joined(old: LimbTraining, new: LimbTraining) -> LimbTraining:
+def join_training(old: LimbTraining, new: LimbTraining) -> LimbTraining:
     """Return the frames of `old`, then of `new`, which get the label of another movement."""
     before = _labels(old)
     labels = np.concatenate([before, np.full(len(new), before.max(initial=-1) + 1)])
@@ -75,7 +75,7 @@ def joined(old: LimbTraining, new: LimbTraining) -> LimbTraining:
     )
 
 
-def evenly(chain: Chain, training: LimbTraining, most: int = MOST) -> LimbTraining:
+def thin_evenly(chain: Chain, training: LimbTraining, most: int = MOST) -> LimbTraining:
     """Return at most `most` frames, distributed evenly over postures.
 
     The newest frame of every posture is selected first, then the second newest, and so on. Rare

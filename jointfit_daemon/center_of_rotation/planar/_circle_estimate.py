@@ -88,20 +88,20 @@ def circle_estimate(
     empty = CircleMoments(*(0.0,) * 10)
     m = moments_of_one(x, w) if w.any() else empty
 
-    def lagged(a: float, b: float, square: float) -> float:
+    def lagged_product(a: float, b: float, square: float) -> float:
         d = x - np.array([m.x + a, m.y + b])
         e = np.einsum("nc,nc->n", d, d) - square
         pair = w[1:] * w[:-1]
         return float((pair * e[1:]) @ e[:-1] / (4.0 * square * max(float(pair.sum()), 1e-300)))
 
     return publish(
-        m, lagged, method=method, frames=int(seen.sum()), limits=limits or CircleLimits()
+        m, lagged_product, method=method, frames=int(seen.sum()), limits=limits or CircleLimits()
     )
 
 
 def publish(
     m: CircleMoments[float],
-    lagged: Callable[[float, float, float], float],
+    lagged_product: Callable[[float, float, float], float],
     *,
     method: CircleMethod,
     frames: int,
@@ -113,7 +113,7 @@ def publish(
     ----------
     m : CircleMoments
         Moments of the points.
-    lagged : callable
+    lagged_product : callable
         Function of a center (a, b), relative to the centroid, and R². It returns the mean product
         of the radial residuals of successive frames, m², from which their correlation is computed.
     method : str
@@ -132,16 +132,16 @@ def publish(
         return refused_circle(method, (m.x, m.y), frames, reason)
 
     # correlation between the noise of neighbouring frames reduces the effective number of frames
-    judged = circle_statistics(m, *circle)
-    alike = lagged(*circle) / judged.residual if judged.residual > 0.0 else 0.0
+    statistics = circle_statistics(m, *circle)
+    alike = lagged_product(*circle) / statistics.residual if statistics.residual > 0.0 else 0.0
     wider = variance_inflation(min(max(alike, 0.0), 0.99) if isfinite(alike) else 0.0)
 
     a, b, square = circle
-    cov = (wider * judged.xx, wider * judged.xy, wider * judged.yy)
-    largest = wider * judged.largest
+    cov = (wider * statistics.xx, wider * statistics.xy, wider * statistics.yy)
+    largest = wider * statistics.largest
     T = sqrt(square / largest) if largest > 0.0 else inf
     a, b, cov = temper(a, b, square, cov)
-    radius, arc = sqrt(square), arc_of_spread((m.xx + m.yy - 2.0 * judged.noise) / square)
+    radius, arc = sqrt(square), arc_of_spread((m.xx + m.yy - 2.0 * statistics.noise) / square)
     effective = m.effective / wider
     sd = sqrt(max(cov[0] + cov[2], 0.0))
 
@@ -149,11 +149,11 @@ def publish(
         method=method,
         center=np.array([m.x + a, m.y + b]),
         covariance=np.array([[cov[0], cov[1]], [cov[1], cov[2]]]),
-        noise=sqrt(judged.noise),
-        residual=sqrt(judged.residual),
+        noise=sqrt(statistics.noise),
+        residual=sqrt(statistics.residual),
         radii=np.array([radius]),
         arc=arc,
-        bound=sqrt(judged.bound),
+        bound=sqrt(statistics.bound),
         conditioning=T,
         frames=frames,
         effective_frames=effective,

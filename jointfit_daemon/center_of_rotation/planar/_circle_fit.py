@@ -201,19 +201,19 @@ def fit_circles(
     with np.errstate(all="ignore"):  # results without a circle are masked below
         eta = smallest_roots(m, method)
         a, b, square = circle_from_root(m, eta, method)
-        judged = circle_statistics(m, a, b, square)
+        statistics = circle_statistics(m, a, b, square)
         wider = (
-            persistence(_lagged(points, m, a, b, square) / judged.residual)
+            persistence(_lagged_product(points, m, a, b, square) / statistics.residual)
             if correlated
             else np.ones_like(a)
         )
-        cov = (wider * judged.xx, wider * judged.xy, wider * judged.yy)
-        conditioning = np.sqrt(square / (wider * judged.largest))
+        cov = (wider * statistics.xx, wider * statistics.xy, wider * statistics.yy)
+        conditioning = np.sqrt(square / (wider * statistics.largest))
         if tempered:
             a, b, cov = temper(a, b, square, cov)
         z = m.xx + m.yy
         valid = (m.effective > 3.0) & ~(m.xx * m.yy - m.xy**2 <= ROUNDING * z**2) & (square > 0.0)
-        valid &= arc_shows(m, judged.noise) & np.isfinite(a) & np.isfinite(b)
+        valid &= arc_shows(m, statistics.noise) & np.isfinite(a) & np.isfinite(b)
 
     nan = np.nan
     center = np.where(valid[..., None], np.stack((m.x + a, m.y + b), axis=-1), nan)
@@ -222,8 +222,8 @@ def fit_circles(
         center,
         np.where(valid, np.sqrt(np.where(valid, square, 1.0)), nan),
         np.where(valid[..., None, None], C, nan),
-        np.where(valid, np.sqrt(np.where(valid, judged.noise, 0.0)), nan),
-        np.where(valid, np.where(judged.noise == 0.0, np.inf, conditioning), 0.0),
+        np.where(valid, np.sqrt(np.where(valid, statistics.noise, 0.0)), nan),
+        np.where(valid, np.where(statistics.noise == 0.0, np.inf, conditioning), 0.0),
         valid,
     )
 
@@ -255,7 +255,9 @@ def fit_circle(points: ArrayLike, *, method: CircleMethod = "hyper") -> tuple[fl
     return m.x + a, m.y + b, square**0.5
 
 
-def _lagged(points: ArrayLike, m: CircleMoments[Array], a: Array, b: Array, square: Array) -> Array:
+def _lagged_product(
+    points: ArrayLike, m: CircleMoments[Array], a: Array, b: Array, square: Array
+) -> Array:
     """Return the mean product of the radial residuals of successive points, m², shape (...)."""
     p = np.asarray(points, dtype=np.float64)
     d = p - np.stack((m.x + a, m.y + b), axis=-1)[..., None, :]

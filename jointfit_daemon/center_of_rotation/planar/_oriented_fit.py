@@ -155,7 +155,7 @@ def oriented_estimate(
         return refused_circle(METHOD, (0.0, 0.0), len(x), reason)
 
     center, covariance, residual = aided
-    held = guarded(center, covariance, fit_circles(x))
+    held = limit_center(center, covariance, fit_circles(x))
     return replace(
         _accept_estimate(x, held, alone, allowed),
         noise=sigma,
@@ -164,7 +164,7 @@ def oriented_estimate(
     )
 
 
-def guarded(center: Array, C: Array, circle: Circles) -> tuple[Array, Array, float]:
+def limit_center(center: Array, C: Array, circle: Circles) -> tuple[Array, Array, float]:
     """Limit the distance of a center with angles from the circle fit of the path alone.
 
     Parameters

@@ -103,8 +103,8 @@ class RunningCircle:
             # Advance one frame without a measurement.
             mu = self._forgetting
             if mu < 1.0:
-                self._sums = _scaled(self._sums, mu)
-                self._lagged = _scaled(self._lagged, mu * mu)
+                self._sums = _scale_sums(self._sums, mu)
+                self._lagged = _scale_sums(self._lagged, mu * mu)
                 self._squares *= mu * mu
             self._before = (0.0, 0.0, 0.0)
             if self._window is not None and self._kept and self._kept[-1][2] > 0.0:
@@ -150,7 +150,7 @@ class RunningCircle:
             mu * j + w,
         )
         self._squares = mu * mu * self._squares + w * w
-        self._lagged = _paired(self._lagged, mu * mu, (x, y, w), self._before)
+        self._lagged = _add_pair(self._lagged, mu * mu, (x, y, w), self._before)
         self._before = (x, y, w)
 
     def _slide(self, frame: Kept) -> None:
@@ -165,7 +165,7 @@ class RunningCircle:
         a = self._sums
         self._sums = tuple(s - w * g for s, g in zip(a, gone, strict=True))  # type: ignore[assignment]  # ten
         self._squares -= w * w
-        self._lagged = _paired(self._lagged, 1.0, kept[0], (x, y, -w))
+        self._lagged = _add_pair(self._lagged, 1.0, kept[0], (x, y, -w))
         self.frames -= 1
         while kept and kept[0][2] == 0.0:
             kept.popleft()
@@ -185,7 +185,10 @@ class RunningCircle:
         dx, dy = self._sums[7] / weight, self._sums[8] / weight
         if dx * dx + dy * dy < (_FAR_M / 2) ** 2:
             return x, y
-        self._sums, self._lagged = _moved(self._sums, dx, dy), _moved(self._lagged, dx, dy)
+        self._sums, self._lagged = (
+            _move_origin(self._sums, dx, dy),
+            _move_origin(self._lagged, dx, dy),
+        )
         bx, by, bw = self._before
         self._before = (bx - dx, by - dy, bw)
         self._kept = deque((kx - dx, ky - dy, kw) for kx, ky, kw in self._kept)
@@ -274,11 +277,11 @@ class RunningCircle:
         return 1.0 if off <= allowed else allowed / off
 
 
-def _scaled(sums: Sums, factor: float) -> Sums:
+def _scale_sums(sums: Sums, factor: float) -> Sums:
     return tuple(factor * s for s in sums)  # type: ignore[return-value]  # ten in, ten out
 
 
-def _paired(sums: Sums, mu: float, now: Kept, before: Kept) -> Sums:
+def _add_pair(sums: Sums, mu: float, now: Kept, before: Kept) -> Sums:
     """Return the symmetrized sums of products of each frame with the preceding frame."""
     x, y, w = now
     u, v, weight = before
@@ -301,7 +304,7 @@ def _paired(sums: Sums, mu: float, now: Kept, before: Kept) -> Sums:
     )
 
 
-def _moved(sums: Sums, dx: float, dy: float) -> Sums:
+def _move_origin(sums: Sums, dx: float, dy: float) -> Sums:
     """Return the sums about an origin moved by (dx, dy): products of (z, x, y, 1) are bilinear."""
     zz, zx, zy, z, xx, xy, yy, x, y, w = sums
     M = np.array([[zz, zx, zy, z], [zx, xx, xy, x], [zy, xy, yy, y], [z, x, y, w]])

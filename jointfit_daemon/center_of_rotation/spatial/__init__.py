@@ -3,7 +3,7 @@
 from jointfit_daemon.center_of_rotation.spatial._geometric_solver import (
     NOISE_FACTOR,
     SphereOptions,
-    judge_sphere,
+    evaluate_sphere,
     solve_sphere,
 )
 from jointfit_daemon.center_of_rotation.spatial._observability import SphereLimits
@@ -21,21 +21,21 @@ from jointfit_daemon.center_of_rotation.spatial._sphere_fit import (
     gamage_lasenby,
     halvorsen,
 )
-from jointfit_daemon.center_of_rotation.spatial._sphere_sums import centered
+from jointfit_daemon.center_of_rotation.spatial._sphere_sums import center_sums
 
 __all__ = [
     "NOISE_FACTOR",
     "RunningSphere",
     "SphereLimits",
     "SphereOptions",
-    "centered",
+    "center_sums",
+    "evaluate_sphere",
     "fit_axis",
     "fit_running",
     "fit_score",
     "fit_sphere",
     "gamage_lasenby",
     "halvorsen",
-    "judge_sphere",
     "objection",
     "relative",
     "solve_sphere",

@@ -1,7 +1,7 @@
 """Robust geometric fit of concentric spheres.
 
-The center keeps its start value along unobservable directions. `judge_sphere` checks whether a fit
-is accepted.
+The center keeps its start value along unobservable directions. `evaluate_sphere` checks whether a
+fit is accepted.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ def solve_sphere(points: Array, options: SphereOptions) -> SphereFit:
         huber = np.minimum(1.0, options.huber * scale / np.maximum(np.abs(e), 1e-12))
         w = np.where(seen, huber, 0.0)
         e, J = radial_residuals(v, m, w)
-        basis = _observed(v, w, m, scale, options)
+        basis = _observed_basis(v, w, m, scale, options)
         if basis.shape[1] == 0:
             break
         Jb = J @ basis
@@ -166,7 +166,7 @@ def _begin(v: Array, w: Array, start: Array, options: SphereOptions) -> Array:
     return np.asarray(start + np.linalg.solve(A + 2.0 * len(total) * least * np.eye(3), b))
 
 
-def _observed(v: Array, w: Array, m: Array, scale: float, options: SphereOptions) -> Array:
+def _observed_basis(v: Array, w: Array, m: Array, scale: float, options: SphereOptions) -> Array:
     """Return an orthonormal basis (3, r) of the observed directions.
 
     Noise changes the unit vector u from the center to a marker only perpendicular to u. The
@@ -195,7 +195,7 @@ def _observed(v: Array, w: Array, m: Array, scale: float, options: SphereOptions
     return np.asarray(axes[:, keep])
 
 
-def judge_sphere(
+def evaluate_sphere(
     fit: SphereFit, method: str, frames: int, limits: SphereLimits, options: SphereOptions
 ) -> CenterEstimate:
     r"""Return the estimate of a fit with its covariance, or a refused estimate.

@@ -149,7 +149,7 @@ def observe(
             # One direction alone does not determine a center. All directions are then used, and the
             # predicted error is large.
             shown = shown if shown.sum() >= 2 else np.ones_like(shown)
-            return _spread(sums, basis, flat, found, left=left, shown=axes[:, shown])
+            return _observed_center(sums, basis, flat, found, left=left, shown=axes[:, shown])
 
         basis = basis @ axes[:, 1:]
 
@@ -195,7 +195,7 @@ def within95(rank: int, freedom: float) -> float:
     return chi2 * (1.0 + (chi2 - rank + 2.0) / (2.0 * max(freedom, 2.0)))
 
 
-def _spread(
+def _observed_center(
     sums: SphereSums,
     basis: Array,
     paths: MarkerPaths,

@@ -16,7 +16,7 @@ from jointfit_daemon.center_of_rotation.spatial._sphere_estimate import center_o
 from jointfit_daemon.center_of_rotation.spatial._sphere_sums import (
     LAGS,
     SphereSums,
-    centered,
+    center_sums,
     sum_up,
 )
 
@@ -184,7 +184,7 @@ class RunningSphere:
         found, spheres = center_of(sums, near=self._near, shape=self._shape, limits=self._limits)
         if self._robust:
             known = spheres is not None and found.refused is None
-            self._expected = _expected(sums, found, spheres) if known and spheres else None
+            self._expected = _expect_markers(sums, found, spheres) if known and spheres else None
 
         flags = tuple(f"marker_moved:{j}" for j in sorted(self._restarted))
         return replace(found, flags=found.flags + flags) if flags else found
@@ -249,12 +249,12 @@ class RunningSphere:
         return w
 
 
-def _expected(
+def _expect_markers(
     sums: SphereSums, found: CenterEstimate, spheres: ConcentricSpheres
 ) -> _ExpectedMarkers:
     k, d = sums.origin.shape
     used = np.isfinite(found.radii)
-    at = centered(sums)
+    at = center_sums(sums)
     mean = np.where(used[:, None], at.origin - sums.origin, 0.0)
     across = np.eye(d) - found.unseen.T @ found.unseen
     a = (found.center - at.origin) @ across

@@ -22,7 +22,7 @@ from jointfit_daemon.center_of_rotation.spatial._observability import (
     moving_directions,
     observe,
 )
-from jointfit_daemon.center_of_rotation.spatial._sphere_sums import centered
+from jointfit_daemon.center_of_rotation.spatial._sphere_sums import center_sums
 
 if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
@@ -89,7 +89,7 @@ def center_of(
         reason = f"{sums.frames} usable frames, at least {MIN_FRAMES} are needed"
         return refusal(method, d, sums.frames, f"{reason}: keep the markers visible"), None
 
-    sums = centered(sums.only(usable))
+    sums = center_sums(sums.only(usable))
     paths = paths_of(sums, None if shape is None else shape[usable])
     basis = moving_directions(paths)
     if basis.shape[1] == 0:

@@ -18,7 +18,7 @@ from jointfit_daemon.center_of_rotation.spatial._geometric_solver import SphereO
 from jointfit_daemon.center_of_rotation.spatial._observability import SphereLimits
 from jointfit_daemon.center_of_rotation.spatial._parent_frame_noise import relative
 from jointfit_daemon.center_of_rotation.spatial._sphere_estimate import MIN_FRAMES, center_of
-from jointfit_daemon.center_of_rotation.spatial._sphere_sums import centered, sum_up
+from jointfit_daemon.center_of_rotation.spatial._sphere_sums import center_sums, sum_up
 
 if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
@@ -70,17 +70,17 @@ def halvorsen(points: Array, min_direction: float = 0.0) -> CenterEstimate:
 
 
 def _linear(points: Array, method: str, steps: int, min_direction: float) -> CenterEstimate:
-    judged, _ = center_of(
+    estimate, _ = center_of(
         sum_up(points), method=method, limits=SphereLimits(min_direction=min_direction)
     )
-    if len(judged.unseen) > 0:
-        why = FLAT if judged.refused is None else judged.refused
-        return refusal(method, 3, judged.frames, why)
+    if len(estimate.unseen) > 0:
+        why = FLAT if estimate.refused is None else estimate.refused
+        return refusal(method, 3, estimate.frames, why)
 
-    used = np.isfinite(judged.radii)
+    used = np.isfinite(estimate.radii)
     points = points[:, used]
     seen = np.asarray(np.isfinite(points).all(axis=-1))
-    paths = paths_of(centered(sum_up(points)))
+    paths = paths_of(center_sums(sum_up(points)))
     A = paths.C.sum(axis=0)
     b = np.einsum("jab,jb->a", paths.C, paths.mean) + paths.c.sum(axis=0) / 2.0
     m = np.linalg.solve(A, b)
@@ -90,8 +90,8 @@ def _linear(points: Array, method: str, steps: int, min_direction: float) -> Cen
         noise2 = float((e[seen] ** 2).sum()) / max(int(seen.sum()) - len(paths.n) - 3, 1)
         m = np.linalg.solve(A, b - noise2 * (paths.mean - m).sum(axis=0))
 
-    flags = judged.flags if steps else (*judged.flags, "biased_on_short_arcs")
-    return replace(judged, center=m, flags=flags)
+    flags = estimate.flags if steps else (*estimate.flags, "biased_on_short_arcs")
+    return replace(estimate, center=m, flags=flags)
 
 
 def fit_sphere(

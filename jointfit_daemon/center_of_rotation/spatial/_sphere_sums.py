@@ -89,7 +89,7 @@ def sum_up(points: Array, weights: Array | None = None) -> SphereSums:
     return SphereSums(origin, M, L, (w * w).sum(axis=0), int(np.count_nonzero(seen.any(axis=1))))
 
 
-def centered(sums: SphereSums) -> SphereSums:
+def center_sums(sums: SphereSums) -> SphereSums:
     r"""Return the sums about the mean of each marker; markers without frames are unchanged.
 
     If the reference point moves, φ is multiplied by a matrix T. The sums are then

@@ -78,7 +78,7 @@ def oriented_centers(points: Array, angles: Array, interval: float = 0.02) -> Ar
     found, H = start, np.zeros((len(z), 4, 4))
 
     # the scale error uses angles without noise, which increase evenly from frame to frame
-    values, U = _wandering(n, interval)
+    values, U = _is_wandering(n, interval)
     even = np.arange(n) - 0.5 * (n - 1)
     g = _TOLD.gain * np.outer(theta @ even, even) / (even @ even)
 
@@ -89,11 +89,11 @@ def oriented_centers(points: Array, angles: Array, interval: float = 0.02) -> Ar
         weights = _Weights(U, d, h / np.sqrt(1.0 + (g * h).sum(axis=-1, keepdims=True)))
         found, H = _descend(_Runs(z, theta, noise, weights, weights.diagonal(), radius), found)
 
-    return np.asarray(_guarded(found[:, :2], H, circles).reshape(*shape, 2))
+    return np.asarray(_limit_centers(found[:, :2], H, circles).reshape(*shape, 2))
 
 
 @cache
-def _wandering(n: int, interval: float) -> tuple[Array, Array]:
+def _is_wandering(n: int, interval: float) -> tuple[Array, Array]:
     """Return eigenvalues and eigenvectors of the angle covariance without the scale error."""
     apart = interval * np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
     slow = _TOLD.slow**2 * np.exp(-apart / _TOLD.time)
@@ -167,7 +167,7 @@ def _cost(runs: _Runs, at: Array) -> tuple[Array, Array, Array]:
     return cost, g, H
 
 
-def _guarded(center: Array, H: Array, circles: Circles) -> Array:
+def _limit_centers(center: Array, H: Array, circles: Circles) -> Array:
     """Limit the distance of the centers from the circle fits, as `guarded` does for one run."""
     C = np.linalg.inv(H + 1e-9 * H * np.eye(4))[:, :2, :2]
     held = circles.valid & (circles.noise > _LEAST_NOISE_M)

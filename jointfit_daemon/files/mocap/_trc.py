@@ -23,14 +23,14 @@ import numpy as np
 from jointfit_daemon.files.text import (
     MalformedFileError,
     cells_of,
+    format_instant,
+    format_value,
     number,
     read_lines,
     require_times,
     rows_of_numbers,
     separator_of,
     strip_trailing_empty,
-    written,
-    written_time,
 )
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ def _require_header(path: Path, lines: Sequence[str]) -> None:
 def write_trc(path: Path, trajectories: MarkerTrajectories) -> None:
     """Write a TRC file in metres: tabs, 8 significant digits, empty cells for missing markers."""
     count, markers = len(trajectories.t_s), len(trajectories.names)
-    rate = written(trajectories.rate_hz)
+    rate = format_value(trajectories.rate_hz)
     first = int(trajectories.frames[0]) if count else 1
     header = (rate, rate, count, markers, "m", rate, first, count)
 
@@ -168,5 +168,5 @@ def write_trc(path: Path, trajectories: MarkerTrajectories) -> None:
     ]
     flat = trajectories.positions.reshape(count, -1)
     for frame, t_s, cells in zip(trajectories.frames, trajectories.t_s, flat, strict=True):
-        rows.append("\t".join([str(int(frame)), written_time(t_s), *map(written, cells)]))
+        rows.append("\t".join([str(int(frame)), format_instant(t_s), *map(format_value, cells)]))
     path.write_text("\n".join(rows) + "\n", encoding="utf-8")

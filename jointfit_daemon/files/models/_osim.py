@@ -96,12 +96,12 @@ def read_osim(path: Path, *, markers: Collection[str] | None = None) -> Imported
         raise MalformedFileError(f"{path}: {error}") from error
 
     chosen = [m for m in document.markers if markers is None or m.name in markers]
-    riders = [rider for m in chosen if (rider := tree.placed(m)) is not None]
-    keep = tree.needed({m.segment for m in riders}) if riders else set(tree.segments)
+    riders = [rider for m in chosen if (rider := tree.place_marker(m)) is not None]
+    keep = tree.needed_segments({m.segment for m in riders}) if riders else set(tree.segments)
     if not riders:
         tree.remarks.append("no markers: all bodies are included")
 
-    segments = tree.kept(keep)
+    segments = tree.kept_segments(keep)
     try:
         model = ChainModel(tuple(segments), tuple(riders), document.name)
     except InvalidChainModelError as error:
@@ -171,13 +171,13 @@ class _Tree:
                 _vector(center),
                 _vector(joint.center),
                 _vector(joint.axis),
-                _turned(rest),
+                _z_up_quaternion(rest),
                 joint.limits,
                 () if joint.path is None else _path(joint.path, placed[:3, :3]),
             ),
         )
 
-    def placed(self, marker: OsimMarker) -> Marker | None:
+    def place_marker(self, marker: OsimMarker) -> Marker | None:
         """Return a marker on its segment; for a marker fixed to the world, None with a remark."""
         segment, transform = self._at[marker.body]
         if segment is None:
@@ -187,7 +187,7 @@ class _Tree:
         fixed = marker.fixed
         return Marker(marker.name, segment, _vector(at), locked=(fixed, fixed, fixed))
 
-    def needed(self, marked: set[str]) -> set[str]:
+    def needed_segments(self, marked: set[str]) -> set[str]:
         """Return the segments with markers and the segments that connect them."""
         paths = {name: self._path(name) for name in marked}
         keep = {above for path in paths.values() for above in path}
@@ -208,7 +208,7 @@ class _Tree:
             above = self.segments[above].parent
         return path
 
-    def kept(self, keep: set[str]) -> list[Segment]:
+    def kept_segments(self, keep: set[str]) -> list[Segment]:
         """Return the segments to keep. A root whose parent is omitted moves freely."""
         left = [name for name in self.segments if name not in keep]
         if left:
@@ -242,11 +242,11 @@ def _path(path: Array, placed: Array) -> tuple[Sample, ...]:
     turns = rotation.multiply(rotation.from_matrix(placed), path[:, 1:5])
     shifts = path[:, 5:] @ placed.T
     return tuple(
-        (q, *_turned(turn), *_vector(shift))
+        (q, *_z_up_quaternion(turn), *_vector(shift))
         for q, turn, shift in zip(path[:, 0].tolist(), turns, shifts, strict=True)
     )
 
 
-def _turned(q: Array) -> Quaternion:
+def _z_up_quaternion(q: Array) -> Quaternion:
     w, x, y, z = q.tolist()
     return (w, z, x, y)

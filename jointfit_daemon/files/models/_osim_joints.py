@@ -171,7 +171,7 @@ def _about_one(
     rest, axis, angles, bent = _axis(np.delete(turns, [1, 2], axis=0))
     above, own, missed = _centers(joint, turns[3:], shifts[3:])
     if missed > _TELL_M or bent > _TELL_RAD:
-        return _coupled(joint, motion, coordinate, welded)
+        return _coupled_joint(joint, motion, coordinate, welded)
 
     ends = _turned_about(rotation.from_matrix(rest), rotation.from_matrix(turns[1:3]), axis)[1]
     limits = (min(ends[0], angles[1]), max(ends[1], angles[-1]))
@@ -188,7 +188,7 @@ def _about_one(
     )
 
 
-def _coupled(
+def _coupled_joint(
     joint: OsimJoint, motion: JointMotion, coordinate: Coordinate, welded: NearestJoint
 ) -> NearestJoint:
     """Return a joint as samples of its motion, which extend beyond its range, with the errors."""

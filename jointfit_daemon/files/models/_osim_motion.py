@@ -64,7 +64,10 @@ class JointMotion:
         if joint.kind == "CustomJoint" and joint.spatial is not None:
             axes = [_custom(axis) for axis in joint.spatial.iterfind("TransformAxis")]
         elif joint.kind in _TURNS:
-            vectors = [*_padded(_TURNS[joint.kind]), *_padded(_SHIFTS.get(joint.kind, []))]
+            vectors = [
+                *_pad_to_three(_TURNS[joint.kind]),
+                *_pad_to_three(_SHIFTS.get(joint.kind, [])),
+            ]
             needed = sum(vector is not None for vector in vectors)
             if len(self.names) != needed:
                 raise ValueError(
@@ -90,14 +93,14 @@ class JointMotion:
     @property
     def turning(self) -> frozenset[str]:
         """Coordinates that rotate the child."""
-        return self._driving(self._axes[:_TURNING])
+        return self._driving_functions(self._axes[:_TURNING])
 
     @property
     def shifting(self) -> frozenset[str]:
         """Coordinates that translate the child."""
-        return self._driving(self._axes[_TURNING:])
+        return self._driving_functions(self._axes[_TURNING:])
 
-    def _driving(self, axes: list[tuple[str, Array, Function]]) -> frozenset[str]:
+    def _driving_functions(self, axes: list[tuple[str, Array, Function]]) -> frozenset[str]:
         probe = np.linspace(-1.0, 1.0, 7)
         return frozenset(name for name, _, f in axes if name and np.ptp(f(probe)) > 0.0)
 
@@ -121,7 +124,7 @@ class JointMotion:
         return rotation.to_matrix(q), t
 
 
-def _padded(vectors: list[Array]) -> list[Array | None]:
+def _pad_to_three(vectors: list[Array]) -> list[Array | None]:
     return [*vectors, *[None] * (3 - len(vectors))]
 
 

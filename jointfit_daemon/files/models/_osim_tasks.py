@@ -34,7 +34,7 @@ def read_ik_setup(path: Path) -> IkSetup:
         Not XML, no marker task, or a weight that is not a number of at least 0.
     """
     root = read_xml(path)
-    ignored = [task.get("name", "") for task in root.iter("IKCoordinateTask") if _applied(task)]
+    ignored = [task.get("name", "") for task in root.iter("IKCoordinateTask") if _is_applied(task)]
     try:
         weights = {task.get("name", ""): _weight(task) for task in root.iter("IKMarkerTask")}
         spans = [
@@ -53,7 +53,7 @@ def read_ik_setup(path: Path) -> IkSetup:
     return IkSetup(weights, (spans[0][0], spans[0][1]) if spans else None, tuple(ignored))
 
 
-def _applied(task: Element) -> bool:
+def _is_applied(task: Element) -> bool:
     return text_of(task, "apply", "true").lower() == "true"
 
 
@@ -62,4 +62,4 @@ def _weight(task: Element) -> float:
     weight = float(numbers_of(task, "weight", 1)[0])
     if weight < 0.0:
         raise ValueError(f"{task.get('name')}: weight is {weight:g}, expected 0 or more")
-    return weight if _applied(task) else 0.0
+    return weight if _is_applied(task) else 0.0

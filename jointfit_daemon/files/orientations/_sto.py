@@ -16,6 +16,8 @@ import numpy as np
 from jointfit_daemon.files.text import (
     MalformedFileError,
     cells_of,
+    format_instant,
+    format_value,
     number,
     read_lines,
     reject_sparse_table,
@@ -23,8 +25,6 @@ from jointfit_daemon.files.text import (
     rows_of_numbers,
     separator_of,
     strip_trailing_empty,
-    written,
-    written_time,
 )
 
 if TYPE_CHECKING:
@@ -207,14 +207,14 @@ def write_sto(path: Path, table: TimeTable) -> None:
     ]
 
     for t_s, values in zip(table.t_s, table.values, strict=True):
-        rows.append("\t".join((written_time(t_s), *map(written, values))))
+        rows.append("\t".join((format_instant(t_s), *map(format_value, values))))
     path.write_text("\n".join(rows) + "\n", encoding="utf-8")
 
 
 def write_orientations_sto(path: Path, table: OrientationTable) -> None:
     """Write a STO file of quaternions that OpenSim's tool OpenSense can read."""
     rows = [
-        *([f"DataRate={written(table.rate_hz)}"] if table.rate_hz else []),
+        *([f"DataRate={format_value(table.rate_hz)}"] if table.rate_hz else []),
         "DataType=Quaternion",
         "version=3",
         "OpenSimVersion=4.4",
@@ -224,6 +224,8 @@ def write_orientations_sto(path: Path, table: OrientationTable) -> None:
     ]
 
     for t_s, quaternions in zip(table.t_s, table.quaternions, strict=True):
-        cells = (_UNKNOWN if np.isnan(q[0]) else ",".join(map(written, q)) for q in quaternions)
-        rows.append("\t".join((written_time(t_s), *cells)))
+        cells = (
+            _UNKNOWN if np.isnan(q[0]) else ",".join(map(format_value, q)) for q in quaternions
+        )
+        rows.append("\t".join((format_instant(t_s), *cells)))
     path.write_text("\n".join(rows) + "\n", encoding="utf-8")

@@ -147,7 +147,7 @@ def session_of(
         if stream.group == "markers":
             labels = tuple(dict.fromkeys(channel.object for channel in stream.channels))
             positions = [
-                _required(_matrix(stream, label, POSITION, "xyz"), len(stream.t_s), 3)
+                _fill_missing(_matrix(stream, label, POSITION, "xyz"), len(stream.t_s), 3)
                 for label in labels
             ]
             cells = np.stack(positions, axis=1) if labels else np.empty((len(stream.t_s), 0, 3))
@@ -172,18 +172,18 @@ def _series(stream: ChannelStream, item: str) -> SensorSeries | SegmentSeries | 
         return JointSeries(
             item,
             stream.t_s,
-            _named(stream, item, ANGLE),
-            _named(stream, item, ANGLE_SD),
+            _columns_of(stream, item, ANGLE),
+            _columns_of(stream, item, ANGLE_SD),
             _matrix(stream, item, POSITION, "xyz"),
-            _named(stream, item, POSITION_SD).get(""),
+            _columns_of(stream, item, POSITION_SD).get(""),
         )
-    orientation = _required(_matrix(stream, item, ORIENTATION, "wxyz"), count, 4)
+    orientation = _fill_missing(_matrix(stream, item, ORIENTATION, "wxyz"), count, 4)
     if stream.group == "sensors":
         placement = next(c.placement for c in stream.channels if c.object == item)
         signals = (_matrix(stream, item, quantity, "xyz") for quantity in _INERTIAL)
         return SensorSeries(item, placement, stream.t_s, orientation, *signals)
     return SegmentSeries(
-        item, stream.t_s, orientation, _named(stream, item, ORIENTATION_SD).get("")
+        item, stream.t_s, orientation, _columns_of(stream, item, ORIENTATION_SD).get("")
     )
 
 
@@ -209,7 +209,7 @@ def _stream(
     return ChannelStream(group, name, t_s, tuple(columns), values)
 
 
-def _named(stream: ChannelStream, item: str, quantity: str) -> dict[str, Array]:
+def _columns_of(stream: ChannelStream, item: str, quantity: str) -> dict[str, Array]:
     """Return the columns of one object and one quantity, by component."""
     return {
         channel.component: stream.values[:, k]
@@ -220,11 +220,11 @@ def _named(stream: ChannelStream, item: str, quantity: str) -> dict[str, Array]:
 
 def _matrix(stream: ChannelStream, item: str, quantity: str, components: str) -> Array | None:
     """Return the columns of all components, shape (n, len(components)); None if one is missing."""
-    columns = _named(stream, item, quantity)
+    columns = _columns_of(stream, item, quantity)
     if any(component not in columns for component in components):
         return None
     return np.column_stack([columns[component] for component in components])
 
 
-def _required(values: Array | None, count: int, width: int) -> Array:
+def _fill_missing(values: Array | None, count: int, width: int) -> Array:
     return np.full((count, width), np.nan) if values is None else values

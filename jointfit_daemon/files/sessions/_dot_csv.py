@@ -19,7 +19,7 @@ import numpy as np
 from jointfit_daemon.files.sessions._xsens_columns import (
     axes_columns,
     orientation_columns,
-    unwrapped,
+    unwrap_counter,
 )
 from jointfit_daemon.files.text import (
     MalformedFileError,
@@ -126,7 +126,7 @@ def _read_sensor(path: Path) -> _DotFile:
         raise MalformedFileError(
             f"{path}: rows without {_TIME}: export the recording again, all of them have one"
         )
-    t_s = unwrapped(ticks, _TURN) * _TICK_S
+    t_s = unwrap_counter(ticks, _TURN) * _TICK_S
     require_times(path, t_s)
 
     orientation = orientation_columns(columns, len(t_s))

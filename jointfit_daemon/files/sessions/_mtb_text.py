@@ -16,7 +16,7 @@ import numpy as np
 from jointfit_daemon.files.sessions._xsens_columns import (
     axes_columns,
     orientation_columns,
-    unwrapped,
+    unwrap_counter,
 )
 from jointfit_daemon.files.text import (
     MalformedFileError,
@@ -97,7 +97,7 @@ def _times(path: Path, columns: Mapping[str, Array], rate_hz: float | None) -> t
     """Return the counter's time at the first row, s, and the time of every row since then, s."""
     ticks = columns.get(_SAMPLE_TIME)
     if ticks is not None and len(ticks) and np.isfinite(ticks).all():
-        return float(ticks[0]) * _TICK_S, unwrapped(ticks, _SAMPLE_TIME_TURN) * _TICK_S
+        return float(ticks[0]) * _TICK_S, unwrap_counter(ticks, _SAMPLE_TIME_TURN) * _TICK_S
     counter = columns.get(_COUNTER)
     if counter is None or rate_hz is None or not rate_hz > 0.0:
         raise MalformedFileError(
@@ -105,4 +105,4 @@ def _times(path: Path, columns: Mapping[str, Array], rate_hz: float | None) -> t
             " the recording again, with its header"
         )
     first = float(counter[0]) / rate_hz if len(counter) else 0.0
-    return first, unwrapped(counter, _COUNTER_TURN) / rate_hz
+    return first, unwrap_counter(counter, _COUNTER_TURN) / rate_hz

@@ -92,7 +92,7 @@ def write_sto_session(
         notes += axis.note(path.name)
         if np.isnan(table.quaternions[0]).any():
             notes.append(f"{path.name}: IMUPlacer needs all orientations of the first frame")
-    return _written(session, "orientations, which STO files hold", files, notes)
+    return _session_summary(session, "orientations, which STO files hold", files, notes)
 
 
 def read_sto_session(path: Path) -> SessionData:
@@ -152,7 +152,7 @@ def write_mot_session(session: SessionData, folder: Path) -> WrittenSession:
         if written.frames:
             files.append(written.path)
         notes += [*written.notes, *axis.note(path.name)]
-    return _written(session, "joints, which MOT files hold", files, notes)
+    return _session_summary(session, "joints, which MOT files hold", files, notes)
 
 
 def read_mot_session(path: Path) -> SessionData:
@@ -236,7 +236,7 @@ def _position(values: Mapping[str, Array], joint: str, parts: Sequence[str]) -> 
     return to_z_up(np.column_stack(known), "y") if len(known) == len(parts) else None
 
 
-def _written(
+def _session_summary(
     session: SessionData, contents: str, files: Sequence[Path], notes: Sequence[str]
 ) -> WrittenSession:
     if not files:

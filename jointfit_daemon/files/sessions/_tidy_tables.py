@@ -72,22 +72,24 @@ def tables_of(session: SessionData) -> dict[str, Table]:
     if session.markers is not None:
         for k, label in enumerate(session.markers.labels):
             cells = _columns(_XYZ, session.markers.positions[:, k])
-            parts["markers"].append(_filled({"t_s": session.markers.t_s, "marker": label} | cells))
+            parts["markers"].append(
+                _fill_columns({"t_s": session.markers.t_s, "marker": label} | cells)
+            )
 
     for source, prefix in _SOURCES.items():
         for segment in getattr(session, f"{prefix}segments"):
             head = {"t_s": segment.t_s, "source": source, "segment": segment.name}
             cells = _columns(_Q, segment.orientation) | {"sd_deg": _degrees(segment.sd_rad)}
-            parts["segments"].append(_filled(head | cells))
+            parts["segments"].append(_fill_columns(head | cells))
         for joint in getattr(session, f"{prefix}joints"):
             head = {"t_s": joint.t_s, "source": source, "joint": joint.name}
             for name, angle in joint.angles.items():
                 sd_deg = _degrees(joint.angle_sd.get(name))
                 cells = {"angle": name, "angle_deg": np.rad2deg(angle), "sd_deg": sd_deg}
-                parts["angles"].append(_filled(head | cells))
+                parts["angles"].append(_fill_columns(head | cells))
             if joint.position is not None:
                 cells = _columns(_XYZ, joint.position) | {"sd_m": joint.position_sd}
-                parts["positions"].append(_filled(head | cells))
+                parts["positions"].append(_fill_columns(head | cells))
     if session.events:
         parts["events"].append(_event_table(session.events))
     return {
@@ -102,7 +104,7 @@ def _sensor_table(sensor: SensorSeries) -> Table:
     table |= _columns(_Q, sensor.orientation)
     for name, columns in _INERTIAL.items():
         table |= _columns(columns, getattr(sensor, name))
-    return _filled(table)
+    return _fill_columns(table)
 
 
 def _event_table(events: Sequence[TimelineEvent]) -> Table:
@@ -125,7 +127,7 @@ def _degrees(values: Array | None) -> Array | None:
     return None if values is None else np.rad2deg(values)
 
 
-def _filled(table: Mapping[str, Any]) -> Table:
+def _fill_columns(table: Mapping[str, Any]) -> Table:
     """Return all columns with full length. Texts are repeated, and missing columns are NaN."""
     count = len(table["t_s"])
     filled: Table = {}
@@ -150,14 +152,16 @@ def session_of_tables(tables: Mapping[str, Table], name: str) -> SessionData:
                 str(rows["segment"][0]),
                 rows["t_s"],
                 _stack(rows, _Q),
-                *(_known(_stack(rows, columns)) for columns in _INERTIAL.values()),
+                *(_known_values(_stack(rows, columns)) for columns in _INERTIAL.values()),
             )
             for (item,), rows in _groups(tables, "sensors", ("sensor",))
         )
     }
     for source, prefix in _SOURCES.items():
         series[f"{prefix}segments"] = tuple(
-            SegmentSeries(item, rows["t_s"], _stack(rows, _Q), _known(np.deg2rad(rows["sd_deg"])))
+            SegmentSeries(
+                item, rows["t_s"], _stack(rows, _Q), _known_values(np.deg2rad(rows["sd_deg"]))
+            )
             for (found, item), rows in _groups(tables, "segments", ("source", "segment"))
             if found == source
         )
@@ -190,14 +194,14 @@ def _joints(tables: Mapping[str, Table], source: str) -> Iterable[JointSeries]:
     for joint in dict.fromkeys([*angles, *positions]):
         of_angles, place = angles.get(joint, {}), positions.get(joint)
         first = place if place is not None else next(iter(of_angles.values()))
-        sds = {name: _known(np.deg2rad(rows["sd_deg"])) for name, rows in of_angles.items()}
+        sds = {name: _known_values(np.deg2rad(rows["sd_deg"])) for name, rows in of_angles.items()}
         yield JointSeries(
             joint,
             first["t_s"],
             {name: np.deg2rad(rows["angle_deg"]) for name, rows in of_angles.items()},
             {name: sd for name, sd in sds.items() if sd is not None},
             None if place is None else _stack(place, _XYZ),
-            None if place is None else _known(place["sd_m"]),
+            None if place is None else _known_values(place["sd_m"]),
         )
 
 
@@ -243,6 +247,6 @@ def _stack(rows: Table, names: Sequence[str]) -> Array:
     return np.column_stack([rows[name] for name in names])
 
 
-def _known(values: Array) -> Array | None:
+def _known_values(values: Array) -> Array | None:
     """Return the values, or None if all values are unknown."""
     return None if np.isnan(values).all() else values

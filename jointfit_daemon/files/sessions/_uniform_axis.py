@@ -46,7 +46,7 @@ class UniformAxis:
             return self._empty((4,))
         if self._take(name, t_s):
             return interpolate_orientations(t_s, q, self.t_s)
-        return self._placed(t_s, q)
+        return self._place_rows(t_s, q)
 
     def values(self, name: str, t_s: Array, values: Array) -> Array:
         """Return values of shape (n, ...), one per instant of the axis; NaN where unknown."""
@@ -54,7 +54,7 @@ class UniformAxis:
             return self._empty(values.shape[1:])
         if self._take(name, t_s):
             return interpolate_values(t_s, values, self.t_s)
-        return self._placed(t_s, values)
+        return self._place_rows(t_s, values)
 
     def note(self, file: str) -> list[str]:
         """Return a list with a note that names the interpolated series; empty if there are none."""
@@ -71,7 +71,7 @@ class UniformAxis:
             self.resampled.append(name)
         return True
 
-    def _placed(self, t_s: Array, values: Array) -> Array:
+    def _place_rows(self, t_s: Array, values: Array) -> Array:
         placed = self._empty(values.shape[1:])
         placed[rows_on_axis(t_s, self.t_s)] = values
         return placed

@@ -21,7 +21,7 @@ _QUATERNIONS = (
 _EULER = (("Roll", "Pitch", "Yaw"), ("Euler_X", "Euler_Y", "Euler_Z"))
 
 
-def unwrapped(counter: Array, turn: int) -> Array:
+def unwrap_counter(counter: Array, turn: int) -> Array:
     """Return a counter's increase since its first row, ticks, shape (n,), without wraps."""
     # A step of more than half the range counts as a step back; the rows are then not in order.
     steps = np.mod(np.diff(counter) + turn / 2, turn) - turn / 2

@@ -13,6 +13,8 @@ from jointfit_daemon.files.text._structured import (
 from jointfit_daemon.files.text._tables import (
     MalformedFileError,
     cells_of,
+    format_instant,
+    format_value,
     number,
     read_columns,
     read_lines,
@@ -22,8 +24,6 @@ from jointfit_daemon.files.text._tables import (
     rows_of_numbers,
     separator_of,
     strip_trailing_empty,
-    written,
-    written_time,
 )
 from jointfit_daemon.files.text._toml_text import toml_key, toml_value
 
@@ -32,6 +32,8 @@ __all__ = [
     "MalformedFileError",
     "cells_of",
     "find_structure_fault",
+    "format_instant",
+    "format_value",
     "number",
     "parse_json",
     "parse_toml",
@@ -49,6 +51,4 @@ __all__ = [
     "strip_trailing_empty",
     "toml_key",
     "toml_value",
-    "written",
-    "written_time",
 ]

@@ -56,7 +56,7 @@ def read_toml(path: Path, most_bytes: int = MOST_BYTES) -> dict[str, Any]:
     MalformedFileError
         Not readable, not a regular file, too large, not UTF-8, or not TOML.
     """
-    table: dict[str, Any] = _parsed(path, "TOML", parse_toml, read_text(path, most_bytes))
+    table: dict[str, Any] = _parse_text(path, "TOML", parse_toml, read_text(path, most_bytes))
     return table
 
 
@@ -68,7 +68,7 @@ def read_json(path: Path, most_bytes: int = MOST_BYTES) -> Any:
     MalformedFileError
         Not readable, not a regular file, too large, not UTF-8, or not JSON.
     """
-    return _parsed(path, "JSON", parse_json, read_text(path, most_bytes))
+    return _parse_text(path, "JSON", parse_json, read_text(path, most_bytes))
 
 
 def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
@@ -167,7 +167,7 @@ def _refuse_constant(name: str) -> float:
     raise ValueError(f"{name} is not a JSON number")
 
 
-def _parsed(path: Path, name: str, parse: Callable[[str], Any], text: str) -> Any:
+def _parse_text(path: Path, name: str, parse: Callable[[str], Any], text: str) -> Any:
     try:
         value = parse(text)
     except RecursionError as error:

@@ -197,11 +197,11 @@ def rows_of_numbers(
     return table
 
 
-def written(value: float) -> str:
+def format_value(value: float) -> str:
     """Return a number as text with 8 significant digits; empty if the number is missing."""
     return "" if math.isnan(value) else f"{value:.{DIGITS}g}"
 
 
-def written_time(t_s: float) -> str:
+def format_instant(t_s: float) -> str:
     """Return an instant as text with a resolution of 1 ns, without trailing zeros."""
     return f"{t_s:.9f}".rstrip("0").rstrip(".")

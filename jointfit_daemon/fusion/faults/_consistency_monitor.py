@@ -242,7 +242,7 @@ class ConsistencyMonitor:
         near = None
         for neighbor in link.near:
             if neighbor in verticals:
-                near = None if self._tilted(neighbor) else verticals[neighbor]
+                near = None if self._is_tilted(neighbor) else verticals[neighbor]
                 break
         correction = self._heading_correction(link.a, link.b)
         pair.update(t_ns, a, b, (verticals[link.a], near), correction=correction)
@@ -266,12 +266,12 @@ class ConsistencyMonitor:
         above, below = self._inner[i].proximal, self._inner[i].distal
         consistent = self._consistent[above] and self._consistent[below]
         for link in joint.links:
-            if link.a not in inputs or link.b not in inputs or self._tilted(link.a, link.b):
+            if link.a not in inputs or link.b not in inputs or self._is_tilted(link.a, link.b):
                 continue
             heading = axis_heading_one(inputs[link.a], inputs[link.b])
             if heading is None:
                 continue
-            (expected,), sd = link.expected(verticals[link.a], verticals[link.b])
+            (expected,), sd = link.predict(verticals[link.a], verticals[link.b])
             residual = heading - joint.standing - expected
             residual -= tau * round(residual / tau)
             differences.append(HeadingDifference(link.a, link.b, residual, sd))
@@ -300,7 +300,7 @@ class ConsistencyMonitor:
         corrections = self._disturbances.corrections
         return corrections.get(b, 0.0) - corrections.get(a, 0.0) if corrections else 0.0
 
-    def _tilted(self, *sensors: str) -> bool:
+    def _is_tilted(self, *sensors: str) -> bool:
         """Return whether a pair of any of the sensors is inconsistent in more than heading."""
         return not self._all_consistent and any(
             pair.tilted and (pair.link.a in sensors or pair.link.b in sensors)

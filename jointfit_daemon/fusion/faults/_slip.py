@@ -178,7 +178,7 @@ class SlipDetector:
             Correction of the heading from a to b that `a` and `b` already contain, rad.
         """
         up_a, up_near = verticals
-        (ex, ey, ez), sd = self.link.expected(up_a, up_near)
+        (ex, ey, ez), sd = self.link.predict(up_a, up_near)
         dx, dy, dz = difference_one(a, b)
         residual = rx, ry, rz = dx - ex, dy - ey, dz - ez
         usual = sqrt(3.0) * sd

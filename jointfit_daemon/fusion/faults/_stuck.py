@@ -192,10 +192,12 @@ class StuckSensorDetector:
 
         # Case 1: the limb moved.
         start = sensor.orientations
-        if any(_turned(name, start, orientations, PARTNER_ROTATION) for name in sensor.partners):
+        if any(
+            _has_rotated(name, start, orientations, PARTNER_ROTATION) for name in sensor.partners
+        ):
             return True
         if length_ns >= OTHER_REPEAT_NS and any(
-            _turned(name, start, orientations, OTHER_ROTATION) for name in sensor.others
+            _has_rotated(name, start, orientations, OTHER_ROTATION) for name in sensor.others
         ):
             return True
 
@@ -211,10 +213,10 @@ class StuckSensorDetector:
     def _update_lagging(self, start: Orientations, end: Orientations) -> None:
         """Mark sensors that hardly rotated in two windows in which a partner rotated far."""
         for name, sensor in self._items:
-            if any(_turned(other, start, end, WINDOW_ROTATION) for other in sensor.partners):
+            if any(_has_rotated(other, start, end, WINDOW_ROTATION) for other in sensor.partners):
                 present = name in start and name in end
                 before = sensor.still
-                sensor.still = present and not _turned(
+                sensor.still = present and not _has_rotated(
                     name, start, end, FOLLOWED_SHARE * WINDOW_ROTATION
                 )
                 sensor.lagging = before and sensor.still
@@ -229,7 +231,7 @@ def _squared_half_sine(a: Quaternion, b: Quaternion) -> float:
     return x * x + y * y + z * z
 
 
-def _turned(name: str, start: Orientations, end: Orientations, angle: float) -> bool:
+def _has_rotated(name: str, start: Orientations, end: Orientations, angle: float) -> bool:
     """Return whether a sensor rotated by at least `angle` rad between two frames."""
     a, b = start.get(name), end.get(name)
     if a is None or b is None:

@@ -116,7 +116,7 @@ class ChainModel:
 
     def __post_init__(self) -> None:
         names = [s.name for s in self.segments]
-        wrong = _doubled("segment", names) if names else ["no segments"]
+        wrong = _duplicates("segment", names) if names else ["no segments"]
         for i, s in enumerate(self.segments):
             if s.parent is not None and s.parent not in names[:i]:
                 known = "after it" if s.parent in names else "unknown"
@@ -223,7 +223,7 @@ class ChainModel:
         )
 
 
-def _doubled(what: str, names: Sequence[str]) -> list[str]:
+def _duplicates(what: str, names: Sequence[str]) -> list[str]:
     return [f"{what} {name!r} twice" for name, n in Counter(names).items() if n > 1]
 
 
@@ -260,7 +260,7 @@ def _wrong_path(j: Joint) -> list[str]:
 
 def _wrong_markers(segments: tuple[Segment, ...], markers: tuple[Marker, ...]) -> list[str]:
     names = {s.name for s in segments}
-    wrong = _doubled("marker", [m.name for m in markers])
+    wrong = _duplicates("marker", [m.name for m in markers])
     for m in markers:
         if m.segment not in names:
             wrong.append(f"marker {m.name!r}: no segment {m.segment!r}")

@@ -118,7 +118,7 @@ class NumericInversion:
             values = last if last is not None and not self._attempts[i] else self._start(i, A)
 
         self._iterations[i] += 1
-        values, G, is_found = _stepped(joint, values, A, origin)
+        values, G, is_found = _take_step(joint, values, A, origin)
         if is_found:
             # Angles are limited to ±180°, and the second of three rotations to ±90°.
             values = values - 2.0 * np.pi * np.round(values / (2.0 * np.pi)) * joint.is_angle
@@ -141,7 +141,7 @@ class NumericInversion:
         return np.asarray(values[nearest[max(self._attempts[i] - 1, 0) % len(values)]])
 
 
-def spread(G: Array) -> Array:
+def pseudo_inverse(G: Array) -> Array:
     """Return the pseudo-inverse of a derivative, which maps a step to coordinates."""
     square = G.T @ G + _RIDGE * np.eye(G.shape[-1])
     return np.asarray(np.linalg.solve(square, G.T))
@@ -165,7 +165,7 @@ def _starts(joint: JointCoordinates) -> tuple[Array, Array]:
     return found, joint.pose(found)[0].reshape(-1, 9)
 
 
-def _stepped(
+def _take_step(
     joint: JointCoordinates, values: Array, A: Array, origin: Array
 ) -> tuple[Array, Array, bool]:
     """Return values after a step, the derivative, and whether the pose is reached."""
@@ -188,7 +188,7 @@ def _stepped(
     far = float(between[0].trace()) < 1.0
     off = np.inf if far else float(np.abs(missing).max())
 
-    step = spread(G) @ missing
+    step = pseudo_inverse(G) @ missing
     turned = float(np.abs(step * joint.is_angle).max(initial=0.0))
     scale = min(1.0, _FARTHEST_STEP / max(turned, _SMALLEST_STEP))
     values = values + np.where(joint.is_angle, scale * step, step)

@@ -16,7 +16,7 @@ from jointfit_daemon.kinematics.chains import layout_of
 from jointfit_daemon.kinematics.coordinate_tracking._closed_form import closed_form
 from jointfit_daemon.kinematics.coordinate_tracking._numeric_inversion import (
     NumericInversion,
-    spread,
+    pseudo_inverse,
 )
 
 if TYPE_CHECKING:
@@ -167,7 +167,11 @@ class CoordinateTracker:
             values[rows], rates[rows] = nan, 0.0
             if i in found:
                 values[rows], G = found[i]
-                P = spread(G) @ self._axes[i][:, None] if i in self._axes else spread(G)
+                P = (
+                    pseudo_inverse(G) @ self._axes[i][:, None]
+                    if i in self._axes
+                    else pseudo_inverse(G)
+                )
                 rates[rows, column : column + P.shape[1]] = P
 
 

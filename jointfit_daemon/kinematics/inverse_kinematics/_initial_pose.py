@@ -74,7 +74,7 @@ def start_from_markers(
         if joint.kind != "free":
             cloud = _with_center(*cloud, own, center)
 
-        laid, middle, spans = _laid(*cloud, above_R @ rest[i])
+        laid, middle, spans = _fit_cloud(*cloud, above_R @ rest[i])
         has_markers = bool((slots.places // slots.shape[1] == i).any())
         guessed |= (spans < _THIN_M2) & has_markers
         turned = np.swapaxes(above_R, -1, -2) @ laid
@@ -106,7 +106,7 @@ def _with_center(
     )
 
 
-def _laid(
+def _fit_cloud(
     points: Array, measured: Array, weights: Array, rest: Array
 ) -> tuple[Array, Array, Array]:
     """Return rotation (T, 3, 3), origin (T, 3) and second moment, m^2, (T,) of a marker cloud."""

@@ -223,7 +223,7 @@ def _descend(problem: PoseProblem, start: ChainState) -> PoseSolution:
         given_up = damping > _HOPELESS
         iterations[here] += 1
 
-        state, at = _kept(better, (onward, there), (state, at))
+        state, at = _select_better(better, (onward, there), (state, at))
         cost = np.where(better, new_cost, cost)
         ended = done | given_up
         if ended.any():
@@ -238,7 +238,7 @@ def _descend(problem: PoseProblem, start: ChainState) -> PoseSolution:
     return PoseSolution(found, problem.weights, converged, iterations)
 
 
-def _kept(
+def _select_better(
     better: NDArray[np.bool_], new: tuple[ChainState, MarkerFit], old: tuple[ChainState, MarkerFit]
 ) -> tuple[ChainState, MarkerFit]:
     """Return the new state and fit at instants with a lower cost, and the old values elsewhere."""

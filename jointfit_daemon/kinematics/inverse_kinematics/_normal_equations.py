@@ -46,19 +46,19 @@ class MarkerSlots:
         """Number of segments S and of slots K."""
         return self.points.shape[0], self.points.shape[2]
 
-    def filled(self, values: Array) -> Array:
+    def to_slots(self, values: Array) -> Array:
         """Return (T, M) as (T, S, K), zero in empty slots."""
         out = np.zeros((len(values), self.shape[0] * self.shape[1]))
         out[:, self.places] = values
         return out.reshape(len(values), *self.shape)
 
-    def filled_vectors(self, values: Array) -> Array:
+    def vectors_to_slots(self, values: Array) -> Array:
         """Return (T, M, 3) as (T, S, 3, K), zero in empty slots."""
         out = np.zeros((len(values), self.shape[0] * self.shape[1], 3))
         out[:, self.places] = values
         return np.ascontiguousarray(out.reshape(len(values), *self.shape, 3).swapaxes(-1, -2))
 
-    def taken(self, slots: Array) -> Array:
+    def from_slots(self, slots: Array) -> Array:
         """Return (T, S, 3, K) as (T, M, 3)."""
         flat = slots.swapaxes(-1, -2).reshape(len(slots), -1, 3)
         return np.asarray(flat[:, self.places])
@@ -111,7 +111,7 @@ class MarkerFit:
             np.einsum("tsik,tsik->t", self.cloud[..., 4:, :], self.weighted[..., 4:, :])
         )
 
-    def reweighted(self, weights: Array) -> MarkerFit:
+    def with_weights(self, weights: Array) -> MarkerFit:
         """Return the fit with other weights, shape (T, S, K)."""
         weighted = self.cloud * weights[:, :, None, :]
         return MarkerFit(self.world, self.cloud, weighted, self.couplings)

@@ -170,8 +170,8 @@ class LiveInverseKinematics:
                 f"markers have shape {given.shape}, expected ({len(self._model.markers)}, 3)"
             )
         seen: NDArray[np.bool_] = np.asarray(np.isfinite(given).all(axis=-1))
-        measured = self._slots.filled_vectors(np.where(seen[:, None], given, 0.0)[None])
-        weights = self._slots.filled((self._model.weights * seen)[None])
+        measured = self._slots.vectors_to_slots(np.where(seen[:, None], given, 0.0)[None])
+        weights = self._slots.to_slots((self._model.weights * seen)[None])
         self._fed += 1
         self._evaluations = 0
         place, restarted = self._solve(measured, weights)
@@ -228,12 +228,12 @@ class LiveInverseKinematics:
         at the final state is negligible in a covariance.
         """
         steps, most = limits
-        place, w = self._moved(last, lead, measured, weights), weights
+        place, w = self._move(last, lead, measured, weights), weights
         travelled, equations = lead, None
         for _ in range(steps):
             robust = self._robust(place.at, weights)
             if robust is not w:
-                at, w = place.at.reweighted(robust), robust
+                at, w = place.at.with_weights(robust), robust
                 place = _Place(place.state, at, float(at.cost[0]))
             equations = self._equations(place, last)
             tries = min(_TRIES, most - self._evaluations)
@@ -244,7 +244,7 @@ class LiveInverseKinematics:
                 break
         return _Place(place.state, place.at, place.cost, travelled, equations)
 
-    def _moved(self, state: ChainState, step: Array, measured: Array, weights: Array) -> _Place:
+    def _move(self, state: ChainState, step: Array, measured: Array, weights: Array) -> _Place:
         self._evaluations += 1
         state = step_state(self._slots.layout, state, step[None])
         at = marker_fit(self._slots, state, measured, weights)
@@ -290,7 +290,7 @@ class LiveInverseKinematics:
         most = place.cost * (1.0 + (_OPEN_SLACK if equations.is_open else _ROUNDING))
         for _ in range(tries):
             step = lapack.dpotrs(factor, -equations.g, lower=1)[0]
-            there = self._moved(place.state, step, measured, weights)
+            there = self._move(place.state, step, measured, weights)
             if there.cost <= most:
                 return step, there
             damping = max(_DAMPING, 10.0 * damping)
@@ -299,7 +299,7 @@ class LiveInverseKinematics:
         return self._still, place
 
     def _pose(self, place: _Place, seen: NDArray[np.bool_], *, restarted: bool) -> LivePose:
-        residuals = self._slots.taken(place.at.errors)[0]
+        residuals = self._slots.from_slots(place.at.errors)[0]
         residuals[~seen] = np.nan
         self._learn(place.cost, int(seen.sum()))
         # dpotri would start threads even for small matrices

@@ -126,8 +126,8 @@ def solve_frames(
     slots = marker_slots(model)
     problem = PoseProblem(
         model,
-        slots.filled_vectors(measured),
-        slots.filled(w),
+        slots.vectors_to_slots(measured),
+        slots.to_slots(w),
         tolerance=options.tolerance,
         iterations=options.iterations,
         huber_m=options.huber_m,
@@ -209,7 +209,7 @@ class _Solution:
     def result(self, seen: NDArray[np.bool_], is_open: NDArray[np.bool_]) -> IkResult:
         slots = marker_slots(self.problem.model)
         at = marker_fit(slots, self.state, self.problem.measured, self.weights)
-        residuals = slots.taken(at.errors)
+        residuals = slots.from_slots(at.errors)
         residuals[~seen] = np.nan
 
         return IkResult(

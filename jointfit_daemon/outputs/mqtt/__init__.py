@@ -21,7 +21,7 @@ from jointfit_daemon.outputs.mqtt._signature import (
     SIGNING_KEYS,
     SignatureRejectedError,
     check_age,
-    signed,
+    sign_request,
     verify,
 )
 
@@ -44,6 +44,6 @@ __all__ = [
     "find_rigs",
     "missing_password",
     "request_key_of",
-    "signed",
+    "sign_request",
     "verify",
 ]

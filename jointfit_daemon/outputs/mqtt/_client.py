@@ -20,7 +20,7 @@ from jointfit_daemon.outputs.mqtt._connection import (
     Outgoing,
 )
 from jointfit_daemon.outputs.mqtt._secret_files import RequestKeyError, request_key_of
-from jointfit_daemon.outputs.mqtt._signature import signed
+from jointfit_daemon.outputs.mqtt._signature import sign_request
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping
@@ -100,7 +100,7 @@ class MqttClient:
         while True:
             while self._unread:
                 message = self._unread.popleft()
-                yield message.topic.removeprefix(f"{self.base}/"), _decoded(message.payload)
+                yield message.topic.removeprefix(f"{self.base}/"), _decode_json(message.payload)
             if self._lost is not None:
                 raise self._lost
             self._arrived.clear()
@@ -125,7 +125,7 @@ class MqttClient:
         try:
             request: dict[str, object] = {**arguments, "transaction": transaction}
             if (key := request_key_of(self._settings)) is not None:
-                request = signed(key, topic, request)
+                request = sign_request(key, topic, request)
             if self._lost is not None:
                 raise self._lost
             await self._connection.publish(
@@ -155,7 +155,7 @@ class MqttClient:
         try:
             async for message in self._connection.messages():
                 if message.topic.startswith(topics.RESPONSE.name(self.base)):
-                    reply = _decoded(message.payload)
+                    reply = _decode_json(message.payload)
                     key = reply.get("transaction") if isinstance(reply, dict) else None
                     answer = self._waiting.get(key) if isinstance(key, str) else None
                     if answer is not None and not answer.done():
@@ -175,7 +175,7 @@ class MqttClient:
             self._arrived.set()
 
 
-def _decoded(payload: bytes) -> Any:
+def _decode_json(payload: bytes) -> Any:
     """Return the JSON value of `payload`; None if it is not JSON."""
     try:
         return orjson.loads(payload)

@@ -81,7 +81,7 @@ class TakeoverDetector:
         doublings = self._losses - (1 if taken_over else UNEXPLAINED)
         return doublings >= 0 and self._first_s < NEWCOMER_S * 2**doublings
 
-    def give_way(self) -> None:
+    def restart_count(self) -> None:
         """Treat this daemon as the newer one from now on, also after a restart of the broker."""
         self._first_s, self._losses = 0.0, 0
 

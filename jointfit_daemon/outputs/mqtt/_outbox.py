@@ -146,7 +146,7 @@ class Outbox:
         queue.append((self._clock() + (message.expiry_s or 0), message))
         self._wake.set()
 
-    def reconnected(self) -> None:
+    def requeue_state(self) -> None:
         """Queue all state again, because the broker may have lost it, and drop stream messages.
 
         Responses and events whose acknowledgement is missing are queued again as well.

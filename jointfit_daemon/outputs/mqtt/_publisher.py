@@ -205,7 +205,7 @@ class MqttPublisher:
                 # A takeover closes the connection. A broker that does not answer is therefore no
                 # takeover.
                 silent = NO_ANSWER in reason
-                if silent or not await self._gave_way(lasted_s):
+                if silent or not await self._pause_if_competing(lasted_s):
                     self._report_loss(reason, lasted_s)
             except BrokerLostError as lost:
                 self._report(str(lost))
@@ -215,7 +215,7 @@ class MqttPublisher:
             await asyncio.sleep(delay_s * random.uniform(0.5, 1.0))  # noqa: S311 - no secret
             delay_s = min(2 * delay_s, _LAST_RETRY_S)
 
-    async def emptied(self, within_s: float, *, streams: bool = False) -> None:
+    async def flush(self, within_s: float, *, streams: bool = False) -> None:
         """Wait until the broker has accepted all state and events, for at most `within_s`.
 
         The method returns at once without a connection. With `streams`, it also waits until all
@@ -235,14 +235,14 @@ class MqttPublisher:
             f"base {self._base}: stop one of them, or give each rig its own name"
         )
 
-    async def _gave_way(self, lasted_s: float) -> bool:
+    async def _pause_if_competing(self, lasted_s: float) -> bool:
         """Leave the client id to the daemon that used it first, and wait until that daemon ends."""
         if not self._takeovers.suspects(lasted_s, taken_over=self._taken_over):
             return False
         if not (self._taken_over or await is_publishing(self._settings, GLANCE_S)):
             return False
 
-        self._takeovers.give_way()
+        self._takeovers.restart_count()
         await self._pause()
         return True
 
@@ -296,7 +296,7 @@ class MqttPublisher:
             self._checked_s.clear()
             for echo in self._echoes.values():
                 echo.clear()
-            self._outbox.reconnected()
+            self._outbox.requeue_state()
             began_s, self._taken_over = self._loop.time(), False
 
             try:

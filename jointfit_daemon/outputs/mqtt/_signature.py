@@ -49,7 +49,7 @@ def signature_of(key: bytes, topic: str, request: Mapping[str, Any]) -> str:
     return hmac.new(key, canonical(topic, request), hashlib.sha256).hexdigest()
 
 
-def signed(key: bytes, topic: str, request: Mapping[str, Any]) -> dict[str, Any]:
+def sign_request(key: bytes, topic: str, request: Mapping[str, Any]) -> dict[str, Any]:
     """Return `request` with the current time, a nonce and the signature."""
     stamped = {**request, "t_us": time.time_ns() // 1000, "nonce": secrets.token_hex(16)}
     return stamped | {"signature": signature_of(key, topic, stamped)}

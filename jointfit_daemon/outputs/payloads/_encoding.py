@@ -60,7 +60,7 @@ def encode(payload: Mapping[str, Any]) -> bytes:
     try:
         return orjson.dumps(payload, _to_json, _OPTIONS)
     except TypeError:
-        return orjson.dumps(_sanitized(payload), _to_json, _OPTIONS)
+        return orjson.dumps(_sanitize(payload), _to_json, _OPTIONS)
 
 
 def encode_pose(state: LimbState, offset_ns: int, now_ns: int) -> bytes:
@@ -122,7 +122,7 @@ def encode_optical(state: OpticalState, offset_ns: int) -> bytes:
             "frame": state.number,
             "segments": {
                 segment.name: {
-                    "q": _rounded(segment.q_world_segment, 5),
+                    "q": _round_values(segment.q_world_segment, 5),
                     "residual_deg": _degrees(segment.residual),
                     "residual_rms_deg": _degrees(segment.residual_rms),
                 }
@@ -147,12 +147,12 @@ def encode_sensors(states: SensorStates, offset_ns: int) -> bytes:
             "t_us": (states.t_ns + offset_ns) // _NS_PER_US,
             "sensors": {
                 sensor.name: {
-                    "q": _rounded(sensor.q_world_sensor, 6),
-                    "q_segment": _rounded(sensor.q_world_segment, 6),
+                    "q": _round_values(sensor.q_world_sensor, 6),
+                    "q_segment": _round_values(sensor.q_world_segment, 6),
                 }
                 for sensor in states.sensors
             },
-            "joints": {name: {"q": _rounded(q, 6)} for name, q in states.joints},
+            "joints": {name: {"q": _round_values(q, 6)} for name, q in states.joints},
         }
     )
 
@@ -211,13 +211,13 @@ def encode_sticks(state: StickFigure, offset_ns: int) -> bytes:
             "t_us": (state.t_ns + offset_ns) // _NS_PER_US,
             "frame": state.number,
             "plane": {
-                "normal": _rounded(state.normal, 4),
+                "normal": _round_values(state.normal, 4),
                 "off_plane_m": _metres(state.off_plane),
                 "refused": state.refused,
             },
             "joints": {
                 joint.name: {
-                    "p_m": _rounded(joint.position, 4),
+                    "p_m": _round_values(joint.position, 4),
                     "error_m": _metres(joint.error),
                     "arc_deg": _degrees(joint.arc),
                     "refused": joint.refused,
@@ -225,7 +225,7 @@ def encode_sticks(state: StickFigure, offset_ns: int) -> bytes:
                 for joint in state.joints
             },
             "sticks": {
-                stick.segment: {"ends_m": [_rounded(end, 4) for end in stick.ends]}
+                stick.segment: {"ends_m": [_round_values(end, 4) for end in stick.ends]}
                 for stick in state.sticks
             },
         }
@@ -236,14 +236,14 @@ def _running_center(found: RunningCenter) -> dict[str, Any]:
     covariance, frames, p_value = found.covariance, found.effective_frames, found.p_value
     return {
         "segment": found.segment,
-        "center_m": _rounded(found.center, 5),
+        "center_m": _round_values(found.center, 5),
         "covariance_m2": covariance and [[float(f"{x:.4g}") for x in row] for row in covariance],
-        "unseen": [_rounded(direction, 4) for direction in found.unseen],
-        "axis": _rounded(found.axis, 4),
-        "p_m": _rounded(found.position, 4),
+        "unseen": [_round_values(direction, 4) for direction in found.unseen],
+        "axis": _round_values(found.axis, 4),
+        "p_m": _round_values(found.position, 4),
         "arc_deg": _degrees(found.arc),
         "effective_frames": None if frames is None else round(frames, 1),
-        "shift_m": _rounded(found.shift, 5),
+        "shift_m": _round_values(found.shift, 5),
         "p_value": None if p_value is None else float(f"{p_value:.3g}"),
         "moved": found.moved,
         "refused": found.refused,
@@ -252,7 +252,7 @@ def _running_center(found: RunningCenter) -> dict[str, Any]:
 
 def _optical_joint(joint: OpticalJoint, *, inner: bool) -> dict[str, Any]:
     shown: dict[str, Any] = {
-        "p_m": _rounded(joint.position, 4),
+        "p_m": _round_values(joint.position, 4),
         "gap_m": _metres(joint.gap),
         "residual_m": _metres(joint.distance),
         "residual_rms_m": _metres(joint.distance_rms),
@@ -278,7 +278,7 @@ def _metres(length: float | None) -> float | None:
 
 def _segment(segment: SegmentState) -> dict[str, Any]:
     return {
-        "q": _rounded(segment.q_world_segment, 5),
+        "q": _round_values(segment.q_world_segment, 5),
         "sd_deg": _degrees(segment.sd),
         "used": segment.used,
     }
@@ -287,7 +287,7 @@ def _segment(segment: SegmentState) -> dict[str, Any]:
 def _joint(state: LimbState, number: int) -> dict[str, Any]:
     joint = state.joints[number]
     shown: dict[str, Any] = {
-        "p_m": _rounded(joint.position, 4),
+        "p_m": _round_values(joint.position, 4),
         "sd_m": _metres(joint.position_sd),
     }
     inner = 0 < number < (len(state.segments) or len(state.joints) - 1)
@@ -332,23 +332,23 @@ def _degrees(angle: float | None) -> float | None:
     return round(whole) / 100.0
 
 
-def _rounded(values: Iterable[float] | None, digits: int) -> list[float | None] | None:
+def _round_values(values: Iterable[float] | None, digits: int) -> list[float | None] | None:
     if values is None:
         return None
     scale = 10.0**digits
     return [round(whole) / scale if isfinite(whole := value * scale) else None for value in values]
 
 
-def _sanitized(value: object) -> object:
+def _sanitize(value: object) -> object:
     """Return `value`, in which integers and characters that JSON cannot represent are replaced."""
     if isinstance(value, int):
         return value if abs(value) <= _EXACT else None
     if isinstance(value, str):
         return value.encode("utf-8", "replace").decode("utf-8")
     if isinstance(value, list | tuple | set | frozenset):
-        return [_sanitized(item) for item in value]
+        return [_sanitize(item) for item in value]
     if hasattr(value, "items"):
-        return {_sanitized(key): _sanitized(item) for key, item in value.items()}
+        return {_sanitize(key): _sanitize(item) for key, item in value.items()}
     return value
 
 

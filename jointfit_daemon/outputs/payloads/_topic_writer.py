@@ -173,12 +173,14 @@ class TopicWriter:
             case DeviceStatus(name, online):
                 self._publish(topics.DEVICE_AVAILABILITY, ONLINE if online else OFFLINE, name)
             case DeviceInfo(name, data):
-                self._publish(topics.DEVICE_INFO, self._stamped(printable_data(data), None), name)
+                self._publish(
+                    topics.DEVICE_INFO, self._encode_stamped(printable_data(data), None), name
+                )
             case CalibrationStatus():
                 self._publish_calibration(output)
             case CalibrationProgress(t_ns, phase, progress, text, data):
                 payload = {"phase": phase, "progress": progress, "text": text, "data": data}
-                self._publish(topics.CALIBRATION_PROGRESS, self._stamped(payload, t_ns))
+                self._publish(topics.CALIBRATION_PROGRESS, self._encode_stamped(payload, t_ns))
             case Reply():
                 self._publish_reply(output)
             case _:
@@ -219,7 +221,7 @@ class TopicWriter:
             "text": printable(notice.text),
             "data": printable_data(notice.data),
         }
-        event = self._stamped(payload, notice.t_ns)
+        event = self._encode_stamped(payload, notice.t_ns)
         self._publish(topics.BRIDGE_EVENT, event)
         if self._spool is not None:
             self._spool.add(topics.LATE_EVENT.pattern, event)
@@ -234,7 +236,7 @@ class TopicWriter:
             "done": status.done,
             "quality": quality_payload(status.quality),
         }
-        self._publish(topics.CALIBRATION, self._stamped(payload, status.t_ns))
+        self._publish(topics.CALIBRATION, self._encode_stamped(payload, status.t_ns))
 
         data = {"quality": status.refused} if status.refused else {}
         self.publish_notice(
@@ -265,14 +267,14 @@ class TopicWriter:
     def publish_health(self, health: BridgeHealth) -> None:
         """Publish ``bridge/health``."""
         payload = health_payload(health)
-        self._publish(topics.BRIDGE_HEALTH, self._stamped(payload, self._clock.now_ns()))
+        self._publish(topics.BRIDGE_HEALTH, self._encode_stamped(payload, self._clock.now_ns()))
 
     def publish_log_line(self, level: str, name: str, text: str, suppressed: int) -> None:
         """Publish one log line on ``bridge/log``."""
         line = {"level": level, "logger": name, "text": text, "suppressed": suppressed}
-        self._publish(topics.BRIDGE_LOG, self._stamped(line, self._clock.now_ns()))
+        self._publish(topics.BRIDGE_LOG, self._encode_stamped(line, self._clock.now_ns()))
 
-    def _stamped(self, data: Mapping[str, object], t_ns: int | None) -> bytes:
+    def _encode_stamped(self, data: Mapping[str, object], t_ns: int | None) -> bytes:
         stamp = {} if t_ns is None else {"t_us": (t_ns + self._clock.offset_ns()) // 1000}
         return encode({"v": PAYLOAD_VERSION} | stamp | dict(data))
 

@@ -48,7 +48,7 @@ class RecordingInfo:
 
     def metadata(self) -> dict[str, str]:
         """Return the metadata record of this file."""
-        return sealed({key: orjson.dumps(value).decode() for key, value in asdict(self).items()})
+        return seal({key: orjson.dumps(value).decode() for key, value in asdict(self).items()})
 
     @classmethod
     def from_metadata(cls, given: Mapping[str, str]) -> RecordingInfo:
@@ -59,7 +59,7 @@ class RecordingInfo:
         ValueError
             A key is missing or has another type.
         """
-        values = {key: orjson.loads(text) for key, text in unsealed(given).items()}
+        values = {key: orjson.loads(text) for key, text in unseal(given).items()}
         kinds = {"session": str, "rig": str, "software": str, "began_with_daemon": bool}
         fields = cls.__dataclass_fields__
         for key in fields:
@@ -94,12 +94,12 @@ class RecordingGap:
         )
 
 
-def sealed(values: Mapping[str, str]) -> dict[str, str]:
+def seal(values: Mapping[str, str]) -> dict[str, str]:
     """Return `values` with their checksum."""
     return {**values, _CHECKSUM: f"{_checksum(values):08x}"}
 
 
-def unsealed(given: Mapping[str, str]) -> dict[str, str]:
+def unseal(given: Mapping[str, str]) -> dict[str, str]:
     """Return the values of a metadata record without their checksum.
 
     Raises

@@ -22,7 +22,7 @@ from jointfit_daemon.outputs.recording._channels import (
     channel_form,
     schema_of,
 )
-from jointfit_daemon.outputs.recording._description import sealed
+from jointfit_daemon.outputs.recording._description import seal
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -131,7 +131,7 @@ class PartFile:
             channel, form.encoding, self._schemas[form.schema], form.metadata
         )
         self._channels[channel] = number
-        self._writer.add_metadata(CHANNEL_METADATA, sealed({"id": str(number), "topic": channel}))
+        self._writer.add_metadata(CHANNEL_METADATA, seal({"id": str(number), "topic": channel}))
         return number
 
     def flush(self) -> None:
@@ -163,7 +163,7 @@ class PartFile:
         """
         try:
             self._writer.flush()
-            end = sealed({"next_sequence": str(next_sequence), "reason": reason})
+            end = seal({"next_sequence": str(next_sequence), "reason": reason})
             self._writer.add_metadata(END_METADATA, end)
             self._writer.finish()
             self._buffer.write_to(self._fd)

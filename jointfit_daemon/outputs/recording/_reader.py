@@ -40,7 +40,7 @@ from jointfit_daemon.outputs.recording._channels import (
     SOURCE,
     STATE,
 )
-from jointfit_daemon.outputs.recording._description import RecordingGap, RecordingInfo, unsealed
+from jointfit_daemon.outputs.recording._description import RecordingGap, RecordingInfo, unseal
 from jointfit_daemon.outputs.recording._event_json import DamagedEventError, decode_event
 from jointfit_daemon.outputs.recording._part_file import UNFINISHED
 from jointfit_daemon.pipeline.events import ChunkArrived
@@ -159,10 +159,10 @@ class PartEnd(NamedTuple):
 def _read_metadata(name: str, values: dict[str, str], topics: dict[int, str]) -> PartEnd | None:
     try:
         if name == CHANNEL_METADATA:
-            found = unsealed(values)
+            found = unseal(values)
             topics.setdefault(int(found["id"]), found["topic"])
         if name == END_METADATA:
-            found = unsealed(values)
+            found = unseal(values)
             return PartEnd(int(found["next_sequence"]), found["reason"], complete=False)
     except (ValueError, KeyError):  # damaged; the chunks also contain the channels
         return None
@@ -418,7 +418,7 @@ def open_part(path: Path) -> RecordedPart:
 def _read_info(path: Path, values: dict[str, str]) -> RecordingInfo | None:
     """Return the description of a file; None for a damaged copy, because there are two."""
     try:
-        version = int(unsealed(values)["format"])
+        version = int(unseal(values)["format"])
     except (ValueError, KeyError):
         return None
     if version > FORMAT:

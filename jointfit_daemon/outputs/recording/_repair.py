@@ -88,7 +88,7 @@ def repair_recording(
     RepairStoppedError
         `stopped` returned True.
     """
-    with _unused(source):
+    with _lock_file(source):
         part = open_part(source)
         attachments = [
             RecordedAttachment(name, "application/json", data)
@@ -144,7 +144,7 @@ def _copy(
 
 
 @contextmanager
-def _unused(source: Path) -> Iterator[None]:
+def _lock_file(source: Path) -> Iterator[None]:
     """Raise an error if a daemon is writing the file."""
     fd = os.open(source, os.O_RDONLY | os.O_CLOEXEC)
     try:
@@ -206,7 +206,7 @@ def repair_unfinished(
 
 def _is_written(source: Path) -> bool:
     try:
-        with _unused(source):
+        with _lock_file(source):
             return False
     except (RecordingError, OSError):
         return True

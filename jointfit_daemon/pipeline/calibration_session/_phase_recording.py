@@ -122,7 +122,7 @@ class PhaseRecording:
     ) -> tuple[float, str, dict[str, object]]:
         """Return the progress of a functional phase, which is 1 when all conditions hold."""
         latest = {name: q for name, q in self._latest.items() if name not in silent}
-        look = self._look = guide.look(latest, elapsed_s)
+        look = self._look = guide.update(latest, elapsed_s)
         data: dict[str, object] = {
             "joints": look.joints,
             "parts": look.parts,

@@ -382,14 +382,14 @@ class CalibrationSession:
     def _job(self, phase: CalibrationPhase, trial: CalibrationTrial) -> CalibrationJob:
         """Return the fit that must follow the phase that ended."""
         chain, settings = self._chain, replace(self._settings, static_s=self._static_s)
-        lag_ns = None if self.lags is None else self.lags.known_ns()
+        lag_ns = None if self.lags is None else self.lags.known_lags_ns()
         if phase == CalibrationPhase.ALIGN:
             return AlignJob(chain, settings, trial, lag_ns)
 
         alignment, previous = self._alignment, self.calibration
         if phase == CalibrationPhase.STATIC or self._static is None:
             return StaticJob(chain, settings, trial, alignment, previous)
-        tracked = None if self.lags is None else self.lags.tracked()
+        tracked = None if self.lags is None else self.lags.tracked_lags()
         return FunctionalJob(
             chain, settings, self._static, trial, alignment, previous, lag_ns, tracked
         )

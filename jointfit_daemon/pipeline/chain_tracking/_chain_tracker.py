@@ -112,7 +112,7 @@ class ChainTracker:
         measured = np.where(possible, found, np.nan)
 
         seen: NDArray[np.bool_] = np.asarray(np.isfinite(measured).all(axis=1))
-        reports = self._monitor.see(t_ns, seen)
+        reports = self._monitor.update(t_ns, seen)
         used: NDArray[np.bool_] = seen & ~self._monitor.excluded & (self._model.weights > 0.0)
         names = self._model.marker_names
         if used.sum() < FEWEST_MARKERS:

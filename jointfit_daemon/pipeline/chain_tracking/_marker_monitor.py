@@ -128,7 +128,7 @@ class MarkerMonitor:
         """Continue the search for exchanged labels during a camera frame."""
         self._labels.advance(t_ns)
 
-    def see(self, t_ns: int, seen: NDArray[np.bool_]) -> list[MarkerReport]:
+    def update(self, t_ns: int, seen: NDArray[np.bool_]) -> list[MarkerReport]:
         """Store which markers are visible in a frame, shape (M,)."""
         self._began_ns = t_ns if self._began_ns is None else self._began_ns
         reports = []

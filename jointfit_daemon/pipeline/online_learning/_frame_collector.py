@@ -81,7 +81,7 @@ class OnlineFrameCollector:
     """
 
     def __init__(self, chain: Chain, calibration: Calibration | None, *, wanted: bool) -> None:
-        off = _excluded(chain, calibration, wanted=wanted)
+        off = _exclusion_reason(chain, calibration, wanted=wanted)
         self.active, self._monitor = off is None, LearningMonitor(off)
         self._chain = chain
         self._sensors = [sensor for group in chain.sensors for sensor in group]
@@ -276,7 +276,7 @@ def _abs_dot(p: Quaternion, q: Quaternion) -> float:
     return abs(p[0] * q[0] + p[1] * q[1] + p[2] * q[2] + p[3] * q[3])
 
 
-def _excluded(chain: Chain, calibration: Calibration | None, *, wanted: bool) -> str | None:
+def _exclusion_reason(chain: Chain, calibration: Calibration | None, *, wanted: bool) -> str | None:
     """Return the reason why this configuration excludes online learning; None if it does not."""
     if not wanted:
         return "learn_online is off in rig.toml"

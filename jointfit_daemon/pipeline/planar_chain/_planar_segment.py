@@ -110,12 +110,12 @@ class PlanarSegment:
         if loose or self._loose > _MOST_LOOSE:
             what = "do not move together: check that they are on one segment"
             return MissingPose(f"{names} {what}", faulty=True)
-        if self._exchanged(t_ns, phase(product)):
+        if self._has_exchanged_labels(t_ns, phase(product)):
             return MissingPose(f"{names} look exchanged: correct their labels", faulty=True)
         self._square += _MEMORY * (square - self._square)
         return PlanarPose(turn, origin)
 
-    def _exchanged(self, t_ns: int, angle: float) -> bool:
+    def _has_exchanged_labels(self, t_ns: int, angle: float) -> bool:
         """Return whether exchanged labels have rotated the segment since the last frame."""
         before, self._angle = self._angle, angle
         recent = t_ns - self._angle_ns < _EXCHANGE_NS

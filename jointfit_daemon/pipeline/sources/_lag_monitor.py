@@ -311,11 +311,11 @@ class LagMonitor:
 
     # --- output ------------------------------------------------------------------------------
 
-    def known_ns(self) -> dict[str, int]:
+    def known_lags_ns(self) -> dict[str, int]:
         """Return the lags that rig.toml configures, ns."""
         return {name: round(lag.lag_ns) for name, lag in self._known.items()}
 
-    def tracked(self) -> dict[str, tuple[float, float]]:
+    def tracked_lags(self) -> dict[str, tuple[float, float]]:
         """Return the estimated lags and their standard deviations, ns."""
         return {
             name: (lag.tracked.lag_ns, lag.tracked.sigma_ns)

@@ -86,7 +86,7 @@ class SourceState:
         if lines is not None:
             state.lines = lines
         if before is not None:
-            state.counts, state._withheld = before.counts, before.withheld()
+            state.counts, state._withheld = before.counts, before.withheld_counts()
         return state
 
     def start(self) -> None:
@@ -118,7 +118,7 @@ class SourceState:
             self._withheld[name] += getattr(decoder, name, 0)
         return items
 
-    def withheld(self) -> dict[str, int]:
+    def withheld_counts(self) -> dict[str, int]:
         """Return the number of decoded frames that were not returned, by reason."""
         return {
             name: count + getattr(self._decoder, name, 0) for name, count in self._withheld.items()
@@ -136,7 +136,7 @@ class SourceState:
             sensor = sensors.state(self.source.id)
         else:
             # Add the number of frames that the decoder withheld.
-            withheld = self.withheld()
+            withheld = self.withheld_counts()
             samples = {
                 **samples,
                 "received": self.counts.received + sum(withheld.values()),

@@ -65,6 +65,6 @@ class SyncLines:
 
     def _tie(self, line: _Line, name: str) -> None:
         reference = line.clocks.get(line.reference or "")
-        for own, other in line.edges.matched(name):
+        for own, other in line.edges.match_edges(name):
             if reference is not None:
                 line.clocks[name].feed_sync_edge(own, other, reference)

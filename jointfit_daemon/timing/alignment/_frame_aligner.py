@@ -245,7 +245,7 @@ class FrameAligner:
         if t_k is None:
             return None
         if self._served != self._next:
-            return max([t_k, *[stream.given_up_ns(t_k) for _, stream in self._items]])
+            return max([t_k, *[stream.latest_wait_ns(t_k) for _, stream in self._items]])
         if not self._dues:  # otherwise each sample updates only the due time of its own stream
             self._dues = {name: self._due_of(stream) for name, stream in self._items}
         latest = max(self._dues.values())

@@ -185,11 +185,11 @@ class Stream:
         for sample in samples:
             if sample.t_ns >= t_ns:
                 close = before is not None and sample.t_ns - before.t_ns <= self._gap_ns
-                return t_ns if close else self._reached(before, t_ns) or sample.t_ns
+                return t_ns if close else self._time_in_reach(before, t_ns) or sample.t_ns
             before = sample
-        return self._reached(before, t_ns)
+        return self._time_in_reach(before, t_ns)
 
-    def _reached(self, before: _Sample | None, t_ns: int) -> int | None:
+    def _time_in_reach(self, before: _Sample | None, t_ns: int) -> int | None:
         return t_ns if before is not None and t_ns - before.t_ns <= self._reach_ns else None
 
     def due(self, t_ns: int) -> int:
@@ -207,7 +207,7 @@ class Stream:
                 return sample.arrival_ns
         return 0
 
-    def given_up_ns(self, t_ns: int) -> int:
+    def latest_wait_ns(self, t_ns: int) -> int:
         """Return the host time until which a frame without samples waits for this stream, ns.
 
         The frame has the instant `t_ns`. It waits for the usual delay of the stream, without an

@@ -25,7 +25,12 @@ from typing import TYPE_CHECKING
 from jointfit_daemon.timing.clock import _clock_events
 from jointfit_daemon.timing.clock._delay_statistics import DelayStatistics
 from jointfit_daemon.timing.clock._device_time import ArrivalTime, CounterTime, TickTime
-from jointfit_daemon.timing.clock._direct_time import MARGIN_NS, SyncEdgeFit, declared, possible
+from jointfit_daemon.timing.clock._direct_time import (
+    MARGIN_NS,
+    SyncEdgeFit,
+    declared_offset,
+    possible,
+)
 from jointfit_daemon.timing.clock._echo_fit import STALE_NS, EchoFit
 from jointfit_daemon.timing.clock._minimum_delay import CRYSTAL, NOMINAL_RATE, MinimumDelayFilter
 from jointfit_daemon.timing.clock._plausibility import LATE_NS, PlausibilityMonitor
@@ -212,7 +217,7 @@ class DeviceClock:
             self._unix_offset_ns = offset_ns
             if self._tick_clock is not None and self._tick_clock.scale == "unix":
                 self._refused = False
-                self._direct = declared(self._tick_clock, offset_ns)
+                self._direct = declared_offset(self._tick_clock, offset_ns)
 
     def feed_echo(self, echo: ClockEcho, tick_clock: TickClock | None = None) -> None:
         """Add an answered echo; ignored while the tick rate of the device is unknown."""
@@ -314,7 +319,7 @@ class DeviceClock:
                 self._begin(_clock_events.CLOCK_SOURCE_CHANGED)
             self._tick_clock, self._kind = tick_clock, _TICKS
             self._reader = reader = TickTime(tick_clock)
-            self._direct = declared(tick_clock, self._unix_offset_ns)
+            self._direct = declared_offset(tick_clock, self._unix_offset_ns)
         return reader
 
     def _reader_for(
@@ -389,7 +394,7 @@ class DeviceClock:
     def _stamp(self, u: int, arrival_ns: int) -> Stamp:
         estimate = self._estimate(u, arrival_ns)
         if self._direct is not None:
-            estimate = self._directed(u, estimate, self._direct)
+            estimate = self._apply_direct_time(u, estimate, self._direct)
         target, skew, settled, sigma, delay = estimate
         jitter = self.jitter_ns
         self.jitter_ns = delay if jitter is None else jitter + _JITTER_GAIN * (delay - jitter)
@@ -407,7 +412,7 @@ class DeviceClock:
         self.minute.feed(arrival_ns, arrival_ns - t)
         self._looked += 1
         if self._looked >= _SKEW_CHECK_SAMPLES:
-            self._look()
+            self._check_skew()
         return Stamp(t, sigma, settled, self.epoch)
 
     def _estimate(self, u: int, arrival_ns: int) -> Estimate:
@@ -424,7 +429,7 @@ class DeviceClock:
         settled = envelope.settled and (echo is None or not echo.expects_more(arrival_ns))
         return u + offset - self.latency_ns, envelope.skew, settled, sigma, delay
 
-    def _directed(self, u: int, estimate: Estimate, direct: DirectTime) -> Estimate:
+    def _apply_direct_time(self, u: int, estimate: Estimate, direct: DirectTime) -> Estimate:
         """Return the host time from `direct`, or `estimate` if it contradicts this time."""
         self._state_direct = direct.usable(u)
         if not self._state_direct:
@@ -442,7 +447,7 @@ class DeviceClock:
             return estimate
         return target, direct.slope, True, direct.sigma_at(u), delay
 
-    def _look(self) -> None:
+    def _check_skew(self) -> None:
         """Publish a warning, once, if the skew is implausible for any clock."""
         self._looked = 0
         if self._warned or not self._synced:

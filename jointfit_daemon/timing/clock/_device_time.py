@@ -72,7 +72,7 @@ def _ran_on(step_ns: int, elapsed_ns: int) -> bool:
     return near and elapsed_ns >= _SILENCE_LEAST_NS
 
 
-def _backlog_ended(
+def _has_backlog_ended(
     ahead_ns: int, u: int, arrival_ns: int, envelope: MinimumDelayFilter, echo: EchoFit | None
 ) -> bool:
     """Return whether device time is ahead of the arrivals because the sample before was late.
@@ -142,10 +142,10 @@ class TickTime:
                 fell = self._backward >= BACKWARD_LIMIT or self.to_ns(last - ticks) > FALL_NS
                 return None if fell else self.to_ns(ticks)
             step_ns, u = self.to_ns(ticks - last), self.to_ns(ticks)
-            ran_on = _ran_on(step_ns, elapsed) or _backlog_ended(
+            ran_on = _ran_on(step_ns, elapsed) or _has_backlog_ended(
                 step_ns - elapsed, u, arrival_ns, envelope, echo
             )
-            if not ran_on and self._contradicted(ticks - last, counter):
+            if not ran_on and self._contradicts(ticks - last, counter):
                 return None
         self._last, self._arrival_ns, self._backward = ticks, arrival_ns, 0
         self._counter = counter
@@ -158,7 +158,7 @@ class TickTime:
             before %= modulus
         return clock_restart_event(self.to_ns(before), self.to_ns(ticks or 0), elapsed_ns)
 
-    def _contradicted(self, step: int, counter: int | None) -> bool:
+    def _contradicts(self, step: int, counter: int | None) -> bool:
         """Return whether `step` ticks and the counter change contradict each other."""
         before = self._counter
         if counter is None or before is None or step == 0:

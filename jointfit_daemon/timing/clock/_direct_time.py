@@ -159,7 +159,7 @@ DirectTime = DeclaredOffset | SyncEdgeFit
 """A conversion from device to host time that does not use arrivals."""
 
 
-def declared(clock: TickClock, unix_offset_ns: int | None) -> DeclaredOffset | None:
+def declared_offset(clock: TickClock, unix_offset_ns: int | None) -> DeclaredOffset | None:
     """Return the conversion of a clock declared to be the host clock, or None for other clocks.
 
     Parameters

@@ -123,7 +123,7 @@ def mean_feasible_line(
     if low < far and near < high:
         low, high = max(low, near), min(high, far)
 
-    grid = _weighed(rows, middle, scale, (low, high), (prior, prior_sd))
+    grid = _weigh_slopes(rows, middle, scale, (low, high), (prior, prior_sd))
     total = sum([w for _, _, w in grid])
     slope = sum([w * s for s, _, w in grid]) / total
     height = sum([w * h for _, h, w in grid]) / total
@@ -178,7 +178,7 @@ def _height(point: Point, supports: Sequence[Point], near: float, far: float) ->
     return y - supports[-1][1] - far * (u - supports[-1][0])
 
 
-def _weighed(
+def _weigh_slopes(
     rows: list[tuple[float, float]],
     middle: float,
     scale: float,

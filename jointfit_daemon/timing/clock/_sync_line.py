@@ -59,7 +59,7 @@ class SyncLine:
             del waiting[0]
             self.unmatched += 1
 
-    def matched(self, name: str) -> list[tuple[int, int]]:
+    def match_edges(self, name: str) -> list[tuple[int, int]]:
         """Return the newly matched edges as (device time, reference time), ns."""
         waiting, instants = self._waiting.get(name), self._instants
         pairs: list[tuple[int, int]] = []

@@ -237,10 +237,10 @@ def estimate_in_steps(
         fits += [] if found is None else [found]
     if not fits:
         return replace(seen, refused=NO_OVERLAP)
-    return _judged(seen, fits, settings)
+    return _select_fit(seen, fits, settings)
 
 
-def _judged(seen: LagEstimate, fits: list[LagFit], settings: LagSettings) -> LagEstimate:
+def _select_fit(seen: LagEstimate, fits: list[LagFit], settings: LagSettings) -> LagEstimate:
     """Return the estimate from the best fit, with the reason if it is rejected."""
     fit, rival = _best_and_rival(fits, seen)
     estimate = replace(

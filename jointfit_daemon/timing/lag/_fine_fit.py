@@ -133,7 +133,7 @@ def fit_lag(
         bias=bias,
         r2=1.0 - square / max(float(np.sum(linear.rate**2)), _TINY),
         residual_rms=float(np.sqrt(square / linear.residual.size)),
-        mean_weight=float(_clipped(norm, _FIRST_HUBER * _scale(norm)).mean()),
+        mean_weight=float(_huber_weights(norm, _FIRST_HUBER * _scale(norm)).mean()),
         pairs=len(linear.residual),
         converged=converged,
     )
@@ -163,7 +163,7 @@ def _linearize(
     turned = omega @ state.rot.T
     r = g - state.bias - turned
     norm = _norms(r)
-    weight = _clipped(norm, _FIRST_HUBER * _scale(norm) if clip is None else clip)
+    weight = _huber_weights(norm, _FIRST_HUBER * _scale(norm) if clip is None else clip)
 
     # Derivatives with respect to rotation (the matrix of the cross product), bias and lag.
     x, y, z = turned.T
@@ -195,7 +195,7 @@ def _scale(norm: Floats) -> float:
     return max(median, _TINY) / MEDIAN_NORM
 
 
-def _clipped(norm: Floats, clip: float) -> Floats:
+def _huber_weights(norm: Floats, clip: float) -> Floats:
     """Return the Huber weights."""
     return np.minimum(1.0, clip / np.maximum(norm, _TINY))
 
@@ -212,7 +212,7 @@ def _best_clip(linear: LinearizedLag) -> float:
     information = x * x + y * y + z * z
 
     def variance(clip: float) -> float:
-        weight = _clipped(norm, clip)
+        weight = _huber_weights(norm, clip)
         curve = weight * np.where(weight < 1.0, 2.0 / 3.0, 1.0)
         spread = float(information @ (weight * norm) ** 2)
         return spread / float(information @ curve + _TINY) ** 2

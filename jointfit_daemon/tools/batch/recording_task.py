@@ -164,7 +164,7 @@ def _run_steps(task: RecordingTask, folder: Path) -> RecordingResult:
         from jointfit_daemon.tools.report.page import render_report
 
         (folder / REPORT_FILE).write_text(render_report(session), encoding="utf-8")
-    result = _measured(task, session, "; ".join(notes))
+    result = _measure_session(task, session, "; ".join(notes))
     if verification is None:
         return result
     status = "done" if verification.passed else "differs"
@@ -188,7 +188,7 @@ def _calibrate(recording: Path, folder: Path, notes: list[str]) -> Calibration |
     return found.calibration
 
 
-def _measured(task: RecordingTask, session: SessionData, notes: str) -> RecordingResult:
+def _measure_session(task: RecordingTask, session: SessionData, notes: str) -> RecordingResult:
     """Return the summary row of a session."""
     from jointfit_daemon.tools.report.session_results import analyze_session
 

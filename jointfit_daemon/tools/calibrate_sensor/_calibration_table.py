@@ -47,13 +47,13 @@ def make_calibration(
     values |= {"date": date, "serial": serial}
     for part, estimate in estimates.items():
         if isinstance(estimate, GyroscopeEstimate):
-            values["gyroscope_bias_deg_s"] = _rounded(np.rad2deg(estimate.bias))
+            values["gyroscope_bias_deg_s"] = _round_values(np.rad2deg(estimate.bias))
             continue
         if isinstance(estimate, GyroscopeScaleEstimate):
-            values["gyroscope_matrix"] = tuple(_rounded(row) for row in estimate.matrix)
+            values["gyroscope_matrix"] = tuple(_round_values(row) for row in estimate.matrix)
             continue
-        values[f"{part}_bias"] = _rounded(estimate.bias)
-        values[f"{part}_matrix"] = tuple(_rounded(row) for row in estimate.matrix)
+        values[f"{part}_bias"] = _round_values(estimate.bias)
+        values[f"{part}_matrix"] = tuple(_round_values(row) for row in estimate.matrix)
     return SensorCalibrationSettings.model_validate(values)
 
 
@@ -126,7 +126,7 @@ def _trailing(lines: list[str]) -> int:
     return count
 
 
-def _rounded(values: Array) -> tuple[float, ...]:
+def _round_values(values: Array) -> tuple[float, ...]:
     return tuple(float(f"{value:.6g}") for value in values)
 
 

@@ -67,24 +67,24 @@ def tables(setup: StudySetup, study: Sequence[PairMaps], more: StudyExtension) -
         " (2021), repeated",
         _setup(setup),
         "Table 1: correlation of whole maps, prediction–analytic / analytic–grid",
-        _indented(_correlations(study, "grid")),
+        _indent_table(_correlations(study, "grid")),
         "The same with the grid shifted by half a step",
-        _indented(_correlations(study, "shifted grid")),
+        _indent_table(_correlations(study, "shifted grid")),
         f"RMS error of the center, mm, at r = {setup.radii[-1]:g} m and"
         f" σ = {_MM * setup.noise:g} mm; refused: share of runs that hyper refuses",
-        _indented(_errors(study)),
+        _indent_table(_errors(study)),
         f"Median error, mm, of two markers {np.rad2deg(APART_RAD):.0f}° apart that rotate by 2α, at"
         f" r = {setup.radius:g} m and σ = {_MM * setup.noise:g} mm; bisectors: both markers, three"
         " frames; Reuleaux and helical axis: both markers, first and last frame; the others: one"
         f" marker, hyper with {setup.frames} frames",
-        _indented(medians),
+        _indent_table(medians),
         f"Repetition of small angles: median error, mm, after averaging {setup.repeats} repetitions"
         f" at r = {setup.radius:g} m and σ = {_MM * setup.noise:g} mm",
-        _indented(repetition),
+        _indent_table(repetition),
         "Effect of the radius: 95th percentile of the error over that at"
         f" r = {100 * setup.radii[-1]:g} cm, α = {np.rad2deg(setup.step):.0f}°,"
         f" σ = {_MM * LARGE_NOISE_M:g} mm",
-        _indented(
+        _indent_table(
             [
                 ("r, cm", *(f"{100 * r:g}" for r in RADII_M)),
                 ("ratio", *(f"{ratio:.2f}" for ratio in more.radius_effect)),
@@ -155,7 +155,7 @@ def _errors(study: Sequence[PairMaps]) -> list[tuple[str, ...]]:
     return rows
 
 
-def _indented(rows: Sequence[Sequence[str]]) -> str:
+def _indent_table(rows: Sequence[Sequence[str]]) -> str:
     return indent(align_columns(rows, right=range(len(rows[0]))), "  ")
 
 

@@ -47,10 +47,10 @@ class BrokerAddress:
         """Return the address as text for messages."""
         if self.websocket is not None:
             return self.websocket
-        return f"{bracketed(self.host)}:{self.port}{' (TLS)' if self.tls else ''}"
+        return f"{bracket_ipv6(self.host)}:{self.port}{' (TLS)' if self.tls else ''}"
 
 
-def bracketed(host: str) -> str:
+def bracket_ipv6(host: str) -> str:
     """Return `host` in the form of URLs, with IPv6 addresses in brackets."""
     return f"[{host}]" if ":" in host else host
 

@@ -25,7 +25,7 @@ from websockets.typing import Subprotocol
 from jointfit_daemon import __version__
 from jointfit_daemon.tools.dashboard._page_files import PageFile, read_page_files
 from jointfit_daemon.tools.dashboard._tunnel import tunnel
-from jointfit_daemon.tools.dashboard.addresses import bracketed
+from jointfit_daemon.tools.dashboard.addresses import bracket_ipv6
 
 if TYPE_CHECKING:
     import ssl
@@ -268,7 +268,7 @@ def open_listener(listen: ListenAddress) -> socket.socket:
         return socket.create_server(address[:2], family=family, backlog=128)
     except OSError as error:
         raise ValueError(
-            f"--listen {bracketed(listen.host)}:{listen.port}: {error.strerror}:"
+            f"--listen {bracket_ipv6(listen.host)}:{listen.port}: {error.strerror}:"
             " choose another address or port"
         ) from error
 
@@ -280,7 +280,7 @@ def _url(listen: ListenAddress, server: Server, scheme: str) -> str:
         host = own_address()
     elif listen.host == "localhost":
         host = "localhost"
-    return f"{scheme}://{bracketed(host)}:{port}/"
+    return f"{scheme}://{bracket_ipv6(host)}:{port}/"
 
 
 def own_address() -> str:

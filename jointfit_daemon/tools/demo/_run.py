@@ -190,7 +190,7 @@ class DemoRun:
             ("functional", self.limb.functional),
         )
         for phase, motions in phases:
-            await self.simulator.say(f"play {motions[0][0]}")
+            await self.simulator.send_command(f"play {motions[0][0]}")
             await asyncio.sleep(SETTLE_S)
             self._tracker.begin()
             wanted_s = sum(seconds for _, seconds in motions)
@@ -200,7 +200,7 @@ class DemoRun:
 
             async def move(motions: tuple[tuple[str, float], ...] = motions) -> None:
                 for name, seconds in motions:
-                    await self.simulator.say(f"play {name}")
+                    await self.simulator.send_command(f"play {name}")
                     await asyncio.sleep(seconds)
 
             moving = asyncio.create_task(move(), name="demo wearer")
@@ -221,7 +221,7 @@ class DemoRun:
             if int(elapsed / MOTION_S) > played:
                 played = int(elapsed / MOTION_S)
                 motions = self.limb.live
-                await self.simulator.say(f"play {motions[played % len(motions)]}")
+                await self.simulator.send_command(f"play {motions[played % len(motions)]}")
             self.display.step("live", elapsed / seconds, f"{seconds - elapsed:.0f} s to go")
             await asyncio.sleep(0.1)
             self._evaluate()
@@ -263,23 +263,23 @@ class DemoRun:
 
         return {
             "frames": self.score.frames,
-            f"{self.limb.joint}_flexion_rmse_deg": _rounded(self.score.flexion.rms),
+            f"{self.limb.joint}_flexion_rmse_deg": _round_figure(self.score.flexion.rms),
             **{
-                f"{name}_rmse_deg": _rounded(error.rms)
+                f"{name}_rmse_deg": _round_figure(error.rms)
                 for name, error in self.score.segments.items()
                 if name in self.rig.chain.segments
             },
-            "joint_center_error_mm": _rounded(self._center_error_mm()),
+            "joint_center_error_mm": _round_figure(self._center_error_mm()),
             "latency_ms": {
-                "p50": _rounded(percentile(self.latencies_ms, 0.5)),
-                "p99": _rounded(percentile(self.latencies_ms, 0.99)),
+                "p50": _round_figure(percentile(self.latencies_ms, 0.5)),
+                "p99": _round_figure(percentile(self.latencies_ms, 0.99)),
             },
             "samples": counts,
             "corrupt": sum(int(device.get("corrupt") or 0) for device in devices.values()),
             "sent": None if self._sent is None else sum(sent.values()),
             "unaccounted": None if self._sent is None else sum(unaccounted.values()),
             "unaccounted_by_source": None if self._sent is None else unaccounted,
-            "within_2_sd_share": _rounded(self.score.covered / max(1, self.score.flexion.n)),
+            "within_2_sd_share": _round_figure(self.score.covered / max(1, self.score.flexion.n)),
         }
 
     def _center_error_mm(self) -> float | None:
@@ -295,5 +295,5 @@ class DemoRun:
         return error.rms
 
 
-def _rounded(value: float | None) -> float | None:
+def _round_figure(value: float | None) -> float | None:
     return None if value is None else round(value, 3)

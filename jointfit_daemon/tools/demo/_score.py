@@ -57,12 +57,15 @@ class TruthTrack:
                 name: interpolate_one(q, after.orientations[name], share)
                 for name, q in before.orientations.items()
             },
-            {name: _between(p, after.centers[name], share) for name, p in before.centers.items()},
+            {
+                name: _interpolate(p, after.centers[name], share)
+                for name, p in before.centers.items()
+            },
             before.flexion + share * (after.flexion - before.flexion),
         )
 
 
-def _between(a: Vector, b: Vector, share: float) -> Vector:
+def _interpolate(a: Vector, b: Vector, share: float) -> Vector:
     return (
         a[0] + share * (b[0] - a[0]),
         a[1] + share * (b[1] - a[1]),

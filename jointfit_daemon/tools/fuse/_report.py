@@ -56,7 +56,7 @@ def _comparisons(found: MethodEvaluation) -> list[str]:
             continue
         names = [*row.segments, *(f"{joint} flexion" for joint in row.joints)]
         pairs = zip(names, _figures(row), _figures(base[row.trial]), strict=True)
-        lost = [n for n, mine, plain in pairs if _shown(mine) > _shown(plain)]
+        lost = [n for n, mine, plain in pairs if _round_degrees(mine) > _round_degrees(plain)]
         worse.setdefault(row.method, []).extend(f"{n} in {row.trial}" for n in lost)
 
     return [
@@ -122,7 +122,7 @@ def _format_columns(rows: Sequence[Sequence[str]]) -> str:
     return align_columns(rows, right=numeric)
 
 
-def _shown(angle: float) -> float:
+def _round_degrees(angle: float) -> float:
     return round(degrees(angle), _DIGITS)
 
 

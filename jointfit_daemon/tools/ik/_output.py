@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.files.orientations import TimeTable, WrittenTable, write_known_values
-from jointfit_daemon.files.text import written
+from jointfit_daemon.files.text import format_value
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -71,7 +71,10 @@ def _write(path: Path, table: TimeTable) -> WrittenTable:
     if path.suffix.lower() == ".csv":
         lines = [
             ",".join(("time", *table.columns)),
-            *(",".join(map(written, row)) for row in np.column_stack((table.t_s, table.values))),
+            *(
+                ",".join(map(format_value, row))
+                for row in np.column_stack((table.t_s, table.values))
+            ),
         ]
         path.write_text("\n".join(lines) + "\n", encoding="utf-8")
         return WrittenTable(path, len(table.t_s))

@@ -155,7 +155,7 @@ def solve_trial(asked: IkRequest) -> TrialSolution:
             + "".join(f"; {note}" for note in remarks)
         )
     notes += remarks
-    return _described(loaded, motion, trial.trajectories.t_s[part], (found, improved, notes))
+    return _trial_solution(loaded, motion, trial.trajectories.t_s[part], (found, improved, notes))
 
 
 def _weights(asked: IkRequest, setup: IkSetup, model: ChainModel) -> tuple[Array, list[str]]:
@@ -213,7 +213,7 @@ def _check(
     return [listed] if absent else []
 
 
-def _described(
+def _trial_solution(
     loaded: LoadedModel,
     motion: MotionTrial,
     t_s: Array,

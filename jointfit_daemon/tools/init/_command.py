@@ -68,7 +68,7 @@ def init(
 
     ports = tuple(str(each) for each in port or ())
     dialogue = _new_dialogue(show, state, answers, ports, network=network)
-    given = _finished(dialogue, state)
+    given = _run_dialogue(dialogue, state)
     password = _write_password(path, given, show)
     written = write_rig(path, given, dialogue.found)
     if json:
@@ -179,7 +179,7 @@ def _show_found(dialogue: Dialogue, show: Callable[[str], None]) -> None:
         show(f"  {each.address:{width}}  {each.text}")
 
 
-def _finished(dialogue: Dialogue, state: Path) -> Answers:
+def _run_dialogue(dialogue: Dialogue, state: Path) -> Answers:
     """Run the dialogue; after an interruption, report the command that continues it."""
     from jointfit_daemon.tools.init._dialogue import UnansweredError
 

@@ -92,13 +92,13 @@ class Dialogue:
 
     def next(self) -> Asked | None:
         """Return the next question; a list of devices is updated first."""
-        asked = self.asked()
+        asked = self.current_question()
         if asked is None or asked.question.kind != "device":
             return asked
         self.found = self.search.refresh(self.found)
-        return self.asked()
+        return self.current_question()
 
-    def asked(self) -> Asked | None:
+    def current_question(self) -> Asked | None:
         """Return the next question; omit ports that stored answers to later questions use."""
         stored = {value for (key, _), value in self._stored.items() if key == "device"}
         taken = stored - {*self.answers.get(("can_adapters", ""), ())}

@@ -72,7 +72,7 @@ def next_question(answers: Mapping[Key, Any], found: Found) -> Asked | None:
             return Asked(
                 question,
                 subject,
-                question.text.format(subject=_spoken(answers, subject)),
+                question.text.format(subject=_subject_words(answers, subject)),
                 question.default(answers, found, subject),
                 question.choices(answers, found, subject),
                 _is_optional(question, answers, subject),
@@ -85,7 +85,7 @@ def _is_optional(question: Question, answers: Mapping[Key, Any], subject: str) -
     return question.optional or (question.key == "markers" and is_optional(answers, subject))
 
 
-def _spoken(answers: Mapping[Key, Any], subject: str) -> str:
+def _subject_words(answers: Mapping[Key, Any], subject: str) -> str:
     """Return the subject as readable words; names that a user typed remain unchanged."""
     if not subject:
         return ""
@@ -116,13 +116,13 @@ def _owner(question: Question, subject: str) -> str:
     return subject.rpartition(".")[0] if question.is_of_keys else subject
 
 
-def answered(answers: Mapping[Key, Any], found: Found) -> list[tuple[str, Any]]:
+def answered_questions(answers: Mapping[Key, Any], found: Found) -> list[tuple[str, Any]]:
     """Return the text and the answer of every answered question, in the order of the dialogue."""
     given = []
     for question, subject in _in_order(answers, found):
         if (question.key, subject) not in answers:
             break
-        text = question.text.format(subject=_spoken(answers, subject))
+        text = question.text.format(subject=_subject_words(answers, subject))
         given.append((text, answers[question.key, subject]))
     return given
 

@@ -113,9 +113,9 @@ async def find_moved(
         show(f"  Turn the sensor {sensor} by a quarter turn now ({TURN_S:g} s) …")
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(TURN_S):
-                while _turned(ready) is None:  # noqa: ASYNC110 - facts of several devices
+                while _turned_address(ready) is None:  # noqa: ASYNC110 - facts of several devices
                     await asyncio.sleep(_POLL_S)
-        turned = _turned(ready)
+        turned = _turned_address(ready)
     finally:
         for task in tasks:
             task.cancel()
@@ -144,7 +144,7 @@ async def _connect(listeners: Collection[_Listener]) -> None:
         await asyncio.sleep(_POLL_S)
 
 
-def _turned(listeners: Mapping[str, _Listener]) -> str | None:
+def _turned_address(listeners: Mapping[str, _Listener]) -> str | None:
     """Return the address of the only device that was turned."""
     first, *others = sorted(listeners.items(), key=lambda entry: entry[1].turned_rad, reverse=True)
     second = others[0][1].turned_rad if others else 0.0

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from jointfit_daemon.config import LATER
 from jointfit_daemon.tools.init._answer_file import read_answers, write_answers
 from jointfit_daemon.tools.init._dialogue import Dialogue, answer_text
-from jointfit_daemon.tools.init._engine import answered, complete, next_question
+from jointfit_daemon.tools.init._engine import answered_questions, complete, next_question
 from jointfit_daemon.tools.init._parsing import AnswerError
 from jointfit_daemon.tools.init._rig_table import rig_table
 from jointfit_daemon.tools.init._rig_text import rig_text
@@ -127,7 +127,7 @@ class SetUpSession:
 
     def _state(self) -> dict[str, Any]:
         dialogue = self.dialogue
-        asked = dialogue.asked()
+        asked = dialogue.current_question()
         found = dialogue.found
 
         secret = self._password_file() if asked is None else None
@@ -135,7 +135,7 @@ class SetUpSession:
             "question": None if asked is None else _question(asked),
             "answered": [
                 {"text": text, "value": answer_text(value)}
-                for text, value in answered(dialogue.answers, found)
+                for text, value in answered_questions(dialogue.answers, found)
             ],
             "total": len(complete(dialogue.answers, found)),
             "found": [

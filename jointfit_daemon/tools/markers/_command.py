@@ -138,7 +138,7 @@ def markers(
     )
     settings = replace(settings, cost=chosen[1])
     try:
-        chain, remarks, found = _refined(asked, (trials, validate or []), settings)
+        chain, remarks, found = _refine_markers(asked, (trials, validate or []), settings)
     except RefinementError as refused:
         typer.echo(f"jointfit markers: refused: {refused}", err=True)
         raise typer.Exit(EXIT_FAILED) from None
@@ -156,7 +156,7 @@ def _loss(method: str, cost: str) -> tuple[RefinementMethod, RefinementCost]:
     return cast("RefinementMethod", method), cast("RefinementCost", cost)
 
 
-def _refined(
+def _refine_markers(
     asked: ModelRequest, trials: tuple[list[Path], list[Path]], settings: RefinementSettings
 ) -> tuple[ChainModel, tuple[str, ...], Refinement]:
     from rich.console import Console
@@ -165,7 +165,7 @@ def _refined(
     from jointfit_daemon.calibration.marker_refinement import refine_markers
     from jointfit_daemon.tools.markers._trials import load
 
-    chain, remarks, learned, judged = load(asked, *trials)
+    chain, remarks, learned, held_out = load(asked, *trials)
     with Progress(
         *Progress.get_default_columns(),
         TextColumn("{task.fields[error]}"),
@@ -177,7 +177,7 @@ def _refined(
         def show_progress(share: float, rms: float) -> None:
             bar.update(task, completed=share, error=f"{1000 * rms:.2f} mm")
 
-        return chain, remarks, refine_markers(chain, learned, settings, judged, show_progress)
+        return chain, remarks, refine_markers(chain, learned, settings, held_out, show_progress)
 
 
 def _write_result(

@@ -50,7 +50,7 @@ def load(
         A name in a lock option is unknown. A damaged file raises `MalformedFileError`.
     """
     read = [read_marker_trial(path, cast("Axis | None", asked.up)) for path in trials]
-    judges = [read_marker_trial(path, cast("Axis | None", asked.up)) for path in validation]
+    validations = [read_marker_trial(path, cast("Axis | None", asked.up)) for path in validation]
     loaded = load_model(asked.model)
     chain = loaded.chain
     for name in asked.without:
@@ -64,5 +64,7 @@ def load(
     learned = [motion_trial(p.stem, t, chain) for p, t in zip(trials, read, strict=True)]
     chain = with_locks(chain, asked.unlock, "--unlock", locked=False)
     chain = with_locks(chain, asked.lock, "--lock", locked=True)
-    judged = [motion_trial(p.stem, t, chain) for p, t in zip(validation, judges, strict=True)]
-    return chain, loaded.remarks, learned, judged
+    held_out = [
+        motion_trial(p.stem, t, chain) for p, t in zip(validation, validations, strict=True)
+    ]
+    return chain, loaded.remarks, learned, held_out

@@ -40,7 +40,9 @@ def curve_lines(
     shown_s = SHOWN_S if columns >= _LONG else SHOWN_S / 2
     newest_us = rig.poses[-1].t_us if rig.poses else 0
     oldest_us = newest_us - shown_s * 1e6
-    imu, optical = (_known(samples, choice, oldest_us) for samples in (rig.poses, rig.opticals))
+    imu, optical = (
+        _known_points(samples, choice, oldest_us) for samples in (rig.poses, rig.opticals)
+    )
     values = [value for _, value in (*imu, *optical)]
     span = _angle_range(values)
     front, back = (DotCanvas(columns, rows, unicode) for _ in range(2))
@@ -60,7 +62,9 @@ def curve_lines(
     return [*lines, _caption(imu, optical, shown_s, width, unicode=unicode)]
 
 
-def _known(samples: Iterable[AngleSample], choice: AngleChoice, oldest_us: float) -> list[_Point]:
+def _known_points(
+    samples: Iterable[AngleSample], choice: AngleChoice, oldest_us: float
+) -> list[_Point]:
     return [
         (sample.t_us, value)
         for sample in samples

@@ -164,7 +164,7 @@ class MonitorApp(App[int]):
             if request.command == "calibrations":
                 self.state.versions_unreadable(str(none))
             else:
-                self.state.refused(str(none), self._now().monotonic_s)
+                self.state.show_refusal(str(none), self._now().monotonic_s)
             return
         self.state.take_answer(request.command, answer, self._now().monotonic_s)
 
@@ -172,9 +172,9 @@ class MonitorApp(App[int]):
         """Run a task until the task or the program ends; an error in the task ends the program."""
         task = asyncio.create_task(work)
         self._tasks.add(task)
-        task.add_done_callback(self._ended)
+        task.add_done_callback(self._on_task_end)
 
-    def _ended(self, task: asyncio.Task[None]) -> None:
+    def _on_task_end(self, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
         error = None if task.cancelled() else task.exception()
         if isinstance(error, Exception):

@@ -60,10 +60,10 @@ class BrokerLink:
             try:
                 if self._chosen.is_set():
                     await self._follow()
-                elif only := self._state.found_rigs(await find_rigs(self._settings, SEARCH_S)):
+                elif only := self._state.set_found_rigs(await find_rigs(self._settings, SEARCH_S)):
                     self.choose(only)
             except BrokerLostError as lost:
-                self._state.lost(str(lost))
+                self._state.set_lost(str(lost))
                 await asyncio.sleep(RECONNECT_S)
 
     async def request(self, command: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -86,7 +86,7 @@ class BrokerLink:
         try:
             async with MqttClient(self._settings) as client:
                 self._client = client
-                self._state.connected()
+                self._state.set_connected()
                 await client.subscribe(*TOPICS)
                 async for topic, payload in client.messages():
                     self._state.rig.take(topic, payload, self._now())

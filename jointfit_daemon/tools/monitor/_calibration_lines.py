@@ -114,11 +114,11 @@ def _joint_lines(joints: Mapping[str, Any], width: int) -> list[Line]:
         one = _table(joint)
         row: list[tuple[str, Style]] = [
             (title_of(name), "strong"),
-            (_spread(one.get("predicted_error_mm"), 0), ""),
+            (_error_text(one.get("predicted_error_mm"), 0), ""),
         ]
         if wide:
             row += [
-                (_spread(one.get("noise_error_mm"), 1), ""),
+                (_error_text(one.get("noise_error_mm"), 1), ""),
                 (format_number(_number(one.get("arc_deg")), 0, "°"), ""),
                 (str(one.get("source", UNKNOWN)), ""),
             ]
@@ -220,7 +220,7 @@ def _errors(one: StoredVersion) -> str:
     return ", ".join(errors) or "not measured"
 
 
-def _spread(value: Any, decimals: int) -> str:
+def _error_text(value: Any, decimals: int) -> str:
     number = _number(value)
     return UNKNOWN if number is None else f"± {format_number(number, decimals, ' mm')}"
 

@@ -37,15 +37,15 @@ def decode(topic: str, payload: Any) -> BaseModel | None:
         A key is missing or has another type, or the payload has another version.
     """
     found = payload_topic(topic)
-    return None if found is None else _validated(PAYLOADS[found], topic, payload)
+    return None if found is None else _validate(PAYLOADS[found], topic, payload)
 
 
 def decode_answer(command: str, data: Any) -> BaseModel:
     """Return the ``data`` of an answer as its model, with the same errors as `decode`."""
-    return _validated(ANSWERS[command], f"bridge/response/{command}", data)
+    return _validate(ANSWERS[command], f"bridge/response/{command}", data)
 
 
-def _validated(model: type[BaseModel], topic: str, payload: Any) -> BaseModel:
+def _validate(model: type[BaseModel], topic: str, payload: Any) -> BaseModel:
     if not isinstance(payload, dict):
         raise UnreadablePayloadError(f"{topic}: no JSON object; another program publishes here")
     version = payload.get("v", PAYLOAD_VERSION)

@@ -113,7 +113,7 @@ def _event(rig: RigView, name: str, now: Moment) -> str:
     return f"{age}{event.text}"
 
 
-def marked(level: Level, text: str) -> tuple[str, Style]:
+def mark_level(level: Level, text: str) -> tuple[str, Style]:
     """Return a text with the symbol and the style of its level; ``good`` has no colour."""
     style: Style = "" if level == "good" else level
     return f"{SYMBOLS[level]} {text}", style
@@ -132,7 +132,7 @@ def device_lines(rig: RigView, width: int, now: Moment) -> list[Line]:
     ]  # fmt: skip
     rows: list[list[tuple[str, Style]]] = []
     for device in devices:
-        text, style = marked(device.level, device.state)
+        text, style = mark_level(device.level, device.state)
         event = f" · {device.event}" if device.event else ""
         clock_style: Style = "warning" if device.clock_level == "warning" else ""
         rows.append(
@@ -147,7 +147,7 @@ def device_lines(rig: RigView, width: int, now: Moment) -> list[Line]:
 
 def _narrow(device: DeviceSummary, width: int) -> list[Line]:
     name = f"{device.name} {device.place}"
-    text, style = marked(device.level, device.state)
+    text, style = mark_level(device.level, device.state)
     head = Line.of(fit_text(name, min(_NAME + 2, width // 3)), "strong")
     rate = f" {fit_text(device.rate, 9, right=True)} " if device.rate != UNKNOWN else " "
     line = head.add(rate).add(text, style)
@@ -170,7 +170,7 @@ def _counters(rig: RigView, name: str, width: int, now: Moment) -> list[Line]:
     device, counts = _summary(rig, name, now), rig.health.devices[name] if rig.health else None
     if counts is None:
         return []
-    text, style = marked(device.level, device.state)
+    text, style = mark_level(device.level, device.state)
     delay = counts.delay_us
     late_ms = "" if delay is None else (
         f", delay {format_number(_ms(delay.p50), 1)} ms median, {format_number(_ms(delay.p99), 1)}"

@@ -72,7 +72,7 @@ def limb_lines(
         for first, last in _bones(info):
             if first in seen and last in seen:
                 back.line(seen[first], seen[last], every=3 if unicode else 1)
-    return _labelled(render(front, "imu", back, "optical"), front, joints, label)
+    return _add_names(render(front, "imu", back, "optical"), front, joints, label)
 
 
 class _Scale:
@@ -149,7 +149,7 @@ def _blob(canvas: DotCanvas, x: int, y: int) -> None:
             canvas.plot(x + dx, y + dy)
 
 
-def _labelled(
+def _add_names(
     lines: list[Line], canvas: DotCanvas, joints: dict[str, _Dot], width: int
 ) -> list[Line]:
     """Write the name of each joint at the right end of its row if the row has space."""

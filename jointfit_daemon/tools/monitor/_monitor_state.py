@@ -107,16 +107,16 @@ class MonitorState:
         self.base, self.rig, self.stored = base, RigView(), None
         self.choice, self.cursor, self.scroll = None, 0, 0
 
-    def connected(self) -> None:
+    def set_connected(self) -> None:
         """Set the state to connected; the broker sends the retained messages next."""
         self.link, self.reason = ("connected" if self.base is not None else "searching"), ""
         self.rig.bridge, self.listed = "unknown", None
 
-    def lost(self, reason: str) -> None:
+    def set_lost(self, reason: str) -> None:
         """Set the state to disconnected, and store the reason."""
         self.link, self.reason = "lost", printable(reason)
 
-    def found_rigs(self, rigs: Mapping[str, str]) -> str | None:
+    def set_found_rigs(self, rigs: Mapping[str, str]) -> str | None:
         """Store the result of a search; return the base topic if there is only one rig."""
         self.rigs = {base: printable(name) for base, name in sorted(rigs.items())}
         self.link, self.reason = "searching", ""
@@ -129,13 +129,13 @@ class MonitorState:
         if command == "calibrations":
             self._take_versions(answer)
         elif answer.get("status") == "error":
-            self.refused(f"jointfitd refuses {command}: {_fault_text(answer)}", now_s)
+            self.show_refusal(f"jointfitd refuses {command}: {_fault_text(answer)}", now_s)
         else:
             text = printable(_words_of(command, answer))
             self.notice = RequestOutcome(text, False, now_s + _NOTICE_S)
             self.listed = None
 
-    def refused(self, reason: str, now_s: float) -> None:
+    def show_refusal(self, reason: str, now_s: float) -> None:
         """Show the reason why a request was not sent or had no answer."""
         self.notice = RequestOutcome(printable(reason), True, now_s + _NOTICE_S)
 

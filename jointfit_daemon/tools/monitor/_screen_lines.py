@@ -67,7 +67,7 @@ def screen_lines(state: MonitorState, width: int, height: int, now: Moment) -> l
             style: Style = "chosen" if chosen else "muted"
             line = line.add(gap if line.spans else "").add(text, style)
         if width >= _WIDE:
-            line = _spread(line, Line.of(*recording_mark(state.rig, now)), width)
+            line = _justify(line, Line.of(*recording_mark(state.rig, now)), width)
         top.append(line)
     top += wrap(f"✖ {loss}" if loss else "", width, "error")[:_LOSS_LINES]
 
@@ -150,13 +150,13 @@ def _header(state: MonitorState, level: Level, words: str, width: int, now: Mome
         recording, recording_style = recording_mark(rig, now)
         shown = f"{recording}  " if recording else ""
         side = Line.of(shown, recording_style).add(clock, "muted")
-        first = _spread(Line.of(name, "strong"), side, width)
+        first = _justify(Line.of(name, "strong"), side, width)
         return [first, *wrap(words, width, style)[:2]]
     right = Line.of(f"{state.broker}  {clock}", "muted")
-    return [_spread(Line.of(f"{name}  ", "strong").add(words, style), right, width)]
+    return [_justify(Line.of(f"{name}  ", "strong").add(words, style), right, width)]
 
 
-def _spread(left: Line, right: Line, width: int) -> Line:
+def _justify(left: Line, right: Line, width: int) -> Line:
     """Return a line with a left and a right part; the left part is cropped if necessary."""
     free = width - right.width - 1
     return left.fit(free).add(" ") + right if free > 0 else left.fit(width)

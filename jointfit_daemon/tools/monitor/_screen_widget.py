@@ -62,7 +62,7 @@ class ScreenWidget(Widget):
                 continue
             strip = _strip(line)
             old = self._strips[row] if row < len(self._strips) else None
-            regions.append(_changed(old, strip, row))
+            regions.append(_changed_region(old, strip, row))
             self._strips[row : row + 1] = [strip]
 
         if len(lines) < len(self._strips):
@@ -90,7 +90,7 @@ def _strip(line: Line) -> Strip:
     return Strip(segments, line.width)
 
 
-def _changed(old: Strip | None, new: Strip, row: int) -> Region:
+def _changed_region(old: Strip | None, new: Strip, row: int) -> Region:
     """Return the smallest region of a row that contains all changed cells."""
     if old is None or old.cell_length != new.cell_length:
         return Region(0, row, new.cell_length, 1)

@@ -78,7 +78,7 @@ class Publication:
     def __init__(self, rig: Rig, base: str | None, broker: str | None) -> None:
         self._base, self._broker = base, broker
         self._clock = RecordedClock()
-        rig = self._moved(rig)
+        rig = self._redirect_rig(rig)
         self._settings = rig.mqtt
         # The clock is constant, so no message expires. Instead, the replay waits for the broker.
         self._outbox = Outbox(topics.BRIDGE_STATE.name(rig.mqtt.base), clock=lambda: 0.0)
@@ -96,7 +96,7 @@ class Publication:
         """Number of messages that the broker did not accept."""
         return self._outbox.dropped + self._outbox.queued
 
-    def _moved(self, rig: Rig) -> Rig:
+    def _redirect_rig(self, rig: Rig) -> Rig:
         """Return `rig` with the broker and the base topic of the replay."""
         changed: dict[str, object] = {"base": self._base or PREFIX + rig.mqtt.base}
         changed["home_assistant"] = None  # a discovery message would announce another device
@@ -135,7 +135,7 @@ class Publication:
         if isinstance(event, UnixOffset):
             self._clock.recorded_offset_ns = event.offset_ns
         elif isinstance(event, Configured):
-            self._topics.configure(self._moved(event.rig))
+            self._topics.configure(self._redirect_rig(event.rig))
         for output in outputs:
             self._topics.output(output)
         while self._outbox.queued > _FULL:  # noqa: ASYNC110 - the outbox has no event for it
@@ -143,11 +143,11 @@ class Publication:
 
     async def stop(self) -> None:
         """Send the last messages, remove the retained messages, and disconnect."""
-        await self._link.emptied(_DRAIN_S, streams=True)
+        await self._link.flush(_DRAIN_S, streams=True)
         for topic in self._outbox.retained:
             if topic != self._outbox.state_topic:
                 self._outbox.retain(topic, b"")
-        await self._link.emptied(_DRAIN_S)
+        await self._link.flush(_DRAIN_S)
         if self._task is not None:
             self._task.cancel()
             await asyncio.wait([self._task])

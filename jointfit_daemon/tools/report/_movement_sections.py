@@ -21,13 +21,13 @@ from jointfit_daemon.tools.report._svg_plot import (
     line,
     nice_ticks,
     number,
-    padded,
+    pad_limits,
     points,
     responsive,
     second_ticks,
 )
 from jointfit_daemon.tools.report._words import (
-    counted,
+    count_text,
     decimal,
     degree,
     joint_angle,
@@ -178,7 +178,7 @@ def _limits(curves: list[Array]) -> tuple[float, float]:
     known = [curve for curve in known if len(curve)]
     if not known:
         return 0.0, 1.0
-    return padded(
+    return pad_limits(
         min(float(curve.min()) for curve in known), max(float(curve.max()) for curve in known), 0.06
     )
 
@@ -267,7 +267,7 @@ def _cycle_figure(results: SessionResults, joint: JointSeries, angle: str, gait:
     spread = float(np.nanmean(sd))
     caption = (
         f"{name}: {_range_text(mean)} on average, {decimal(spread)}° between cycles,"
-        f" {counted(len(curves.cycles), 'cycle')}"
+        f" {count_text(len(curves.cycles), 'cycle')}"
     )
     return figure(image(_PANEL, 200.0, caption, parts), caption)
 
@@ -278,7 +278,7 @@ def range_section(results: SessionResults) -> str:
         return section("range", "Range of motion", [paragraph("No joint angle is known.")])
     low = min(found.minimum for found in results.ranges)
     high = max(found.maximum for found in results.ranges)
-    limits = padded(float(np.degrees(low)), float(np.degrees(high)), 0.03)
+    limits = pad_limits(float(np.degrees(low)), float(np.degrees(high)), 0.03)
     rows = [
         (
             joint_angle(found.joint, found.angle),
@@ -371,7 +371,7 @@ def comparison_section(results: SessionResults) -> str:
 def _difference_figure(found: AngleDifference) -> str:
     values = np.degrees(found.difference)
     name = joint_angle(found.joint, found.angle)
-    limits = padded(min(0.0, float(values.min())), max(0.0, float(values.max())))
+    limits = pad_limits(min(0.0, float(values.min())), max(0.0, float(values.max())))
     span = (float(found.t_s[0]), float(found.t_s[-1]))
     area = PlotArea(_HALF, 200.0, span, limits)
 
@@ -393,8 +393,8 @@ def _agreement_figure(found: AngleDifference) -> str:
     mean, values = np.degrees(found.mean[::every]), np.degrees(found.difference[::every])
     low, high = (float(np.degrees(limit)) for limit in found.limits)
     name = joint_angle(found.joint, found.angle)
-    x_limits = padded(float(mean.min()), float(mean.max()), 0.04)
-    y_limits = padded(min(low, float(values.min())), max(high, float(values.max())))
+    x_limits = pad_limits(float(mean.min()), float(mean.max()), 0.04)
+    y_limits = pad_limits(min(low, float(values.min())), max(high, float(values.max())))
     area = PlotArea(_HALF, 200.0, x_limits, y_limits)
     x_ticks = [(v, number(v)) for v in nice_ticks(*x_limits, 5)]
     x_ticks = [(v, t + ("°" if v == x_ticks[-1][0] else "")) for v, t in x_ticks]

@@ -17,7 +17,7 @@ from jointfit_daemon.tools.report._svg_plot import (
 )
 from jointfit_daemon.tools.report._words import (
     UNKNOWN,
-    counted,
+    count_text,
     decimal,
     degree,
     duration,
@@ -49,7 +49,7 @@ def sources_section(results: SessionResults) -> str:
 
     segments = {sensor.id: sensor.segment for sensor in results.session.sensors}
     marker_count = len(results.session.markers.labels) if results.session.markers else 0
-    segments["cameras"] = counted(marker_count, "marker")
+    segments["cameras"] = count_text(marker_count, "marker")
     configured = results.values("source")
     rows = [
         (

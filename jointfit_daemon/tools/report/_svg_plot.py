@@ -102,7 +102,9 @@ def time_text(t_s: float, span_s: float) -> str:
     return f"{minutes}:{seconds:02d}"
 
 
-def padded(low: float, high: float, share: float = 0.08, least: float = 1.0) -> tuple[float, float]:
+def pad_limits(
+    low: float, high: float, share: float = 0.08, least: float = 1.0
+) -> tuple[float, float]:
     """Return the limits of an axis with a margin at both ends."""
     if not (isfinite(low) and isfinite(high)):
         return 0.0, 1.0

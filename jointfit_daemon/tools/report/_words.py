@@ -56,6 +56,6 @@ def duration(seconds: float) -> str:
     return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s"
 
 
-def counted(count: int, one: str, many: str = "") -> str:
+def count_text(count: int, one: str, many: str = "") -> str:
     """Return a count with its noun, such as ``1 gap`` or ``2 gaps``."""
     return f"{count} {one if count == 1 else many or one + 's'}"

@@ -25,7 +25,7 @@ from jointfit_daemon.tools.report._recording_sections import (
 )
 from jointfit_daemon.tools.report._words import (
     UNKNOWN,
-    counted,
+    count_text,
     decimal,
     degree,
     duration,
@@ -164,5 +164,5 @@ def _loss_tile(results: SessionResults) -> tuple[str, str, str, bool]:
         return "Samples lost", UNKNOWN, "the file contains no samples", False
     worst = max(shares, key=shares.__getitem__)
     gaps = sum(len(found.gaps_s) for found in results.sources.values())
-    remark = f"worst source: {title(worst)}; {counted(gaps, 'gap')}"
+    remark = f"worst source: {title(worst)}; {count_text(gaps, 'gap')}"
     return "Samples lost", percent(shares[worst]), remark, shares[worst] > _MUCH_LOSS

@@ -40,7 +40,7 @@ def asyncapi_document() -> dict[str, Any]:
 
     def add(topic: Topic, pattern: str, schema: dict[str, Any]) -> str:
         title = schema["title"]
-        schemas[title] = _moved(schema, f"#/components/schemas/{title}")
+        schemas[title] = _move_references(schema, f"#/components/schemas/{title}")
 
         # Convert a topic to a key of the document.
 
@@ -112,13 +112,13 @@ def _operation(action: str, key: str, topic: Topic) -> dict[str, Any]:
     }
 
 
-def _moved(schema: Any, place: str) -> Any:
+def _move_references(schema: Any, place: str) -> Any:
     """Return a schema whose references point to its definitions at `place`."""
     if isinstance(schema, list):
-        return [_moved(item, place) for item in schema]
+        return [_move_references(item, place) for item in schema]
     if not isinstance(schema, dict):
         return schema
-    moved = {key: _moved(value, place) for key, value in schema.items()}
+    moved = {key: _move_references(value, place) for key, value in schema.items()}
     if "$defs" in moved:
         moved["definitions"] = moved.pop("$defs")
     reference = moved.get("$ref")

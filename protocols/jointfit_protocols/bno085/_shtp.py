@@ -88,15 +88,15 @@ def encode_shtp(channel: int, sequence: int, payload: bytes) -> bytes:
     if len(payload) > MOST_PAYLOAD:
         raise ValueError(f"{len(payload)} bytes: an SHTP packet holds {MOST_PAYLOAD}")
     header = _HEADER.pack(len(payload) + _HEADER.size, channel, sequence & 0xFF)
-    return _framed(_SHTP, header + payload)
+    return _encode_frame(_SHTP, header + payload)
 
 
 def encode_status(available: int | None) -> bytes:
     """Return a buffer status on the wire; if `available` is None, return the query for it."""
-    return _framed(_CONTROL, b"" if available is None else available.to_bytes(2, "little"))
+    return _encode_frame(_CONTROL, b"" if available is None else available.to_bytes(2, "little"))
 
 
-def _framed(protocol: int, data: bytes) -> bytes:
+def _encode_frame(protocol: int, data: bytes) -> bytes:
     body = bytes((protocol,)) + data
     body = body.replace(_ESCAPE, bytes((ESCAPE, ESCAPE ^ _INVERTED)))
     return _FLAG + body.replace(_FLAG, bytes((ESCAPE, FLAG ^ _INVERTED))) + _FLAG

@@ -168,7 +168,7 @@ class LpmsConfiguration(NamedTuple):
     floats: bool | None = None
     """Whether values are float32; otherwise they are int16."""
 
-    def updated(self, part: LpmsConfiguration) -> LpmsConfiguration:
+    def merge(self, part: LpmsConfiguration) -> LpmsConfiguration:
         """Return these settings, updated with the known settings of `part`."""
         known = {key: value for key, value in part._asdict().items() if value is not None}
         return self._replace(**known)

@@ -17,7 +17,7 @@ from jointfit_protocols.natnet._frame import (
     LabeledMarker,
     MarkerSet,
     Version,
-    supported,
+    is_supported,
 )
 from jointfit_protocols.natnet._frame_2x import FLAGGED
 from jointfit_protocols.natnet._frame_decode import decode_frame
@@ -87,7 +87,7 @@ __all__ = [
     "decode",
     "decode_frame",
     "encode",
+    "is_supported",
     "is_versioned",
-    "supported",
     "timecode_of",
 ]

@@ -142,7 +142,7 @@ class FrameOfData(NamedTuple):
     """Names of sections that were skipped by their size because their content is unknown."""
 
 
-def supported(version: Version) -> bool:
+def is_supported(version: Version) -> bool:
     """Return whether frames of this bitstream can be decoded, which are those of 2.5 and newer."""
     return version >= OLDEST
 

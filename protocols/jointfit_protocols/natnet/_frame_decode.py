@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.natnet._cursor import BREAKS, Cursor
-from jointfit_protocols.natnet._frame import SIZED, TICKED, read_frame, supported
+from jointfit_protocols.natnet._frame import SIZED, TICKED, is_supported, read_frame
 from jointfit_protocols.natnet._frame_2x import read_frame_2x
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def decode_frame(datagram: bytes, version: Version) -> FrameOfData | CorruptBytes:
     """Return the frame in a complete FRAMEOFDATA datagram, including its header; never raise."""
-    if not supported(version):
+    if not is_supported(version):
         return CorruptBytes(
             len(datagram), f"NatNet bitstream {version[0]}.{version[1]} is not supported"
         )

@@ -21,7 +21,7 @@ from jointfit_protocols.natnet._frame import (
     Analog,
     FrameOfData,
     Version,
-    supported,
+    is_supported,
 )
 from jointfit_protocols.natnet._frame_2x import put_frame_2x
 
@@ -40,7 +40,7 @@ def encode_frame(frame: FrameOfData, version: Version) -> bytes:
     struct.error
         A value is out of the range of its field.
     """
-    if not supported(version):
+    if not is_supported(version):
         raise ValueError(f"bitstream {version[0]}.{version[1]} is not written")
 
     if version < TICKED:

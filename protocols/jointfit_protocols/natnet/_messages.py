@@ -212,7 +212,7 @@ def _read_discovery(data: bytes) -> Discovery | None:
     return None if connect is None else Discovery(connect)
 
 
-def _fixed(
+def _fixed_reader(
     kind: type[EchoRequest | EchoResponse], layout: struct.Struct
 ) -> Callable[[bytes], Message | None]:
     """Return a reader for a message that consists of a single record."""
@@ -235,8 +235,8 @@ _READERS: dict[int, Callable[[bytes], Message | None]] = {
     NatNetMessageId.REQUEST: lambda data: CommandRequest(fixed_text(data)),
     NatNetMessageId.RESPONSE: CommandResponse,
     NatNetMessageId.MESSAGESTRING: lambda data: MessageString(fixed_text(data)),
-    NatNetMessageId.ECHOREQUEST: _fixed(EchoRequest, _STAMP),
-    NatNetMessageId.ECHORESPONSE: _fixed(EchoResponse, _ECHO),
+    NatNetMessageId.ECHOREQUEST: _fixed_reader(EchoRequest, _STAMP),
+    NatNetMessageId.ECHORESPONSE: _fixed_reader(EchoResponse, _ECHO),
     NatNetMessageId.REQUEST_MODELDEF: _bare(NatNetMessageId.REQUEST_MODELDEF),
     NatNetMessageId.REQUEST_FRAMEOFDATA: _bare(NatNetMessageId.REQUEST_FRAMEOFDATA),
     NatNetMessageId.DISCONNECT: _bare(NatNetMessageId.DISCONNECT),

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.natnet._cursor import BREAKS, I32, XYZ, Cursor, MalformedError
-from jointfit_protocols.natnet._frame import SIZED, TICKED, Position, Version, supported
+from jointfit_protocols.natnet._frame import SIZED, TICKED, Position, Version, is_supported
 
 
 class DescriptionType(IntEnum):
@@ -159,7 +159,7 @@ class ModelDefinition(NamedTuple):
 
 def decode_model(datagram: bytes, version: Version) -> ModelDefinition | CorruptBytes:
     """Return the descriptions in a complete MODELDEF datagram with header; never raise."""
-    if not supported(version):
+    if not is_supported(version):
         return CorruptBytes(
             len(datagram), f"NatNet bitstream {version[0]}.{version[1]} is not supported"
         )

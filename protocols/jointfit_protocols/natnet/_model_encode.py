@@ -6,7 +6,7 @@ Invariant: encoding a model that `decode_model` decoded returns the bytes of the
 from __future__ import annotations
 
 from jointfit_protocols.natnet._cursor import I32, XYZ, put_text, put_texts
-from jointfit_protocols.natnet._frame import SIZED, TICKED, TWO_LAYOUT, Version, supported
+from jointfit_protocols.natnet._frame import SIZED, TICKED, TWO_LAYOUT, Version, is_supported
 from jointfit_protocols.natnet._model import (
     ASSET_MARKER_LAYOUT,
     BODY_HEAD_LAYOUT,
@@ -35,7 +35,7 @@ def encode_model(model: ModelDefinition, version: Version) -> bytes:
     ValueError
         The bitstream is older than 2.5, or does not have one of the descriptions.
     """
-    if not supported(version):
+    if not is_supported(version):
         raise ValueError(f"bitstream {version[0]}.{version[1]} is not written")
     parts = [I32.pack(len(model.descriptions))]
     for description in model.descriptions:

@@ -21,7 +21,7 @@ from jointfit_protocols.ximu3._messages import (
     XImu3Reply,
     parse_line,
     parse_rest,
-    unstuffed,
+    unstuff,
 )
 
 MAX_LINE = 4096
@@ -112,7 +112,7 @@ class XImu3Codec:
 
             if escape < after:
                 escape = find(ESCAPE, after) % _NEVER
-                plain = unstuffed(buffer[at:after]) if buffer[at] == first else None
+                plain = unstuff(buffer[at:after]) if buffer[at] == first else None
                 if plain is not None and len(plain) == size:
                     read = unpack_from(plain)
                     fields = (kind, read[0], read[1:], b"", True, after - at, base + after, None)
@@ -133,7 +133,7 @@ class XImu3Codec:
             at = after
 
         self.messages += count
-        self._pending = self._shortened(buffer[at:], found) if at < len(buffer) else b""
+        self._pending = self._drop_start(buffer[at:], found) if at < len(buffer) else b""
         return found
 
     def flush(self) -> list[Found]:
@@ -146,7 +146,7 @@ class XImu3Codec:
     def _message(self, line: bytes, end: int, found: list[Found]) -> XImu3Data | XImu3Reply | None:
         """Return the message of a line, and append the bytes before it to `found` as corrupt."""
         if self._too_long or len(line) > MAX_LINE:
-            line, reason = self._shortened(line, found), _TOO_LONG
+            line, reason = self._drop_start(line, found), _TOO_LONG
             self._too_long = False
         else:
             message = parse_line(line, end)
@@ -164,7 +164,7 @@ class XImu3Codec:
         self._discard(len(line), reason, found)
         return None
 
-    def _shortened(self, line: bytes, found: list[Found]) -> bytes:
+    def _drop_start(self, line: bytes, found: list[Found]) -> bytes:
         """Return the end of a line that is too long, and append the bytes before it as corrupt."""
         blocks = max(len(line) - _MOST_PENDING + MAX_LINE, 0) // MAX_LINE
         for _ in range(blocks):

@@ -172,7 +172,7 @@ def parse_line(line: bytes, end: int = 0) -> Line:
     if inner[0] == OBJECT:
         return _parse_reply(inner, len(line), end, channel)
     if ESCAPE in inner:
-        plain = unstuffed(inner)
+        plain = unstuff(inner)
         return _STUFFING if plain is None else _parse_data(plain, len(line), end, channel)
     return _parse_data(inner, len(line), end, channel)
 
@@ -198,7 +198,7 @@ def parse_rest(rest: bytes, end: int) -> XImu3Data | XImu3Reply | None:
     return found if isinstance(found, XImu3Reply) else None
 
 
-def unstuffed(line: bytes) -> bytes | None:
+def unstuff(line: bytes) -> bytes | None:
     """Return the bytes of a message without escapes; None if an escape is malformed."""
     plain = line.replace(b"\xdb\xdc", b"\n").replace(b"\xdb\xdd", b"\xdb")
     # Each escape that is followed by its second byte makes the line one byte shorter.
@@ -328,9 +328,7 @@ def encode_data(
     if not binary:
         numbers = ",".join(f"{value:.{decimals}f}" for value in values)
         return f"{DataKind(kind)},{ticks},{numbers}\r\n".encode()
-    return _stuffed(
-        _HEAD.pack(ord(kind) | _BINARY, ticks) + struct.pack(f"<{len(values)}f", *values)
-    )
+    return _stuff(_HEAD.pack(ord(kind) | _BINARY, ticks) + struct.pack(f"<{len(values)}f", *values))
 
 
 def encode_text(kind: str, ticks: int, text: bytes, *, binary: bool = True) -> bytes:
@@ -344,8 +342,8 @@ def encode_text(kind: str, ticks: int, text: bytes, *, binary: bool = True) -> b
     if kind in COUNTS:
         raise ValueError(f"a message of kind {kind} has numbers, not text")
     if binary:
-        return _stuffed(_HEAD.pack(ord(kind) | _BINARY, ticks) + text)
-    return _stuffed(f"{DataKind(kind)},{ticks},".encode() + text + b"\r")
+        return _stuff(_HEAD.pack(ord(kind) | _BINARY, ticks) + text)
+    return _stuff(f"{DataKind(kind)},{ticks},".encode() + text + b"\r")
 
 
 def encode_multiplexed(channel: int, message: bytes) -> bytes:
@@ -353,5 +351,5 @@ def encode_multiplexed(channel: int, message: bytes) -> bytes:
     return bytes((MULTIPLEXER, channel)) + message
 
 
-def _stuffed(plain: bytes) -> bytes:
+def _stuff(plain: bytes) -> bytes:
     return plain.replace(b"\xdb", b"\xdb\xdd").replace(b"\n", b"\xdb\xdc") + b"\n"

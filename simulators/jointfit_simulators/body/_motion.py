@@ -35,7 +35,7 @@ from jointfit_simulators.body._posture import (
     ground,
     in_turn,
     on_plate,
-    upright,
+    upright_pose,
     vary,
 )
 
@@ -73,7 +73,7 @@ _CHAIR_S = 5.0
 
 def stand(style: MovementStyle, t: Array) -> Array:
     """Stand upright with a sway of tenths of a degree."""
-    coordinates = upright(style, t)
+    coordinates = upright_pose(style, t)
     coordinates[:, LEG_ANGLES] += style.sway.at(t)
     hip, knee = coordinates[:, HIP], coordinates[:, KNEE]
     coordinates[:, ANKLE] = np.array([1, -1, -1]) * knee - hip  # flat sole
@@ -83,7 +83,7 @@ def stand(style: MovementStyle, t: Array) -> Array:
 
 def walk(style: MovementStyle, t: Array) -> Array:
     """Walk on a treadmill with a constant mean heading."""
-    coordinates = upright(style, t)
+    coordinates = upright_pose(style, t)
     share = t / _STRIDE_S
     phase = 2 * np.pi * share
 
@@ -111,7 +111,7 @@ def walk(style: MovementStyle, t: Array) -> Array:
 
 def _sagittal(style: MovementStyle, t: Array, *, knee: Array, thigh: Array, lean: Array) -> Array:
     """Flex hip, knee and ankle over a flat foot; `thigh` and `lean` are pitch angles in space."""
-    coordinates = upright(style, t)
+    coordinates = upright_pose(style, t)
     coordinates[:, column(PELVIS_TURN, TILT)] = -lean
     coordinates[:, column(HIP, FLEXION)] = thigh + lean
     coordinates[:, column(KNEE, FLEXION)] = knee
@@ -149,7 +149,7 @@ def sit_to_stand(style: MovementStyle, t: Array) -> Array:
 
 def hip_circles(style: MovementStyle, t: Array) -> Array:
     """Swing the almost straight leg in arcs of rotating direction (star-arc movement)."""
-    coordinates = upright(style, t)
+    coordinates = upright_pose(style, t)
     swing = np.sin(2 * np.pi * 0.5 * t)
     direction = 2 * np.pi * t / 13.0
 
@@ -168,7 +168,7 @@ def hip_circles(style: MovementStyle, t: Array) -> Array:
 
 def knee_swings(style: MovementStyle, t: Array) -> Array:
     """Swing the shank with the thigh raised; internal rotation depends on knee flexion."""
-    coordinates = upright(style, t)
+    coordinates = upright_pose(style, t)
     bend = np.radians(55 + 43 * np.sin(2 * np.pi * 0.55 * t))
     coordinates[:, column(HIP, FLEXION)] = np.radians(42 + 8 * np.sin(2 * np.pi * 0.21 * t))
     coordinates[:, column(HIP, ADDUCTION)] = np.radians(5) * np.sin(2 * np.pi * 0.17 * t)
@@ -186,7 +186,7 @@ def knee_swings(style: MovementStyle, t: Array) -> Array:
 
 def leg_swings(style: MovementStyle, t: Array) -> Array:
     """Flex and extend hip, knee and ankle of the raised leg widely, in the sagittal plane only."""
-    coordinates = upright(style, t)
+    coordinates = upright_pose(style, t)
     coordinates[:, column(HIP, FLEXION)] = np.radians(25 + 45 * np.sin(2 * np.pi * 0.31 * t))
     coordinates[:, column(KNEE, FLEXION)] = np.radians(55 + 50 * np.sin(2 * np.pi * 0.43 * t))
     coordinates[:, column(ANKLE, FLEXION)] = np.radians(-10 + 28 * np.sin(2 * np.pi * 0.67 * t))
@@ -196,7 +196,7 @@ def leg_swings(style: MovementStyle, t: Array) -> Array:
 
 def ankle_circles(style: MovementStyle, t: Array) -> Array:
     """Move the raised foot in circles."""
-    coordinates = upright(style, t)
+    coordinates = upright_pose(style, t)
     phase = 2 * np.pi * 0.7 * t
 
     coordinates[:, column(HIP, FLEXION)] = np.radians(25)

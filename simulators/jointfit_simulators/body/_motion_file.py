@@ -30,7 +30,7 @@ from jointfit_daemon.files.orientations import read_sto
 from jointfit_daemon.files.text import read_toml
 from jointfit_simulators.body._limb import ANKLE, HIP, KNEE, PELVIS_POSITION, PELVIS_TURN
 from jointfit_simulators.body._orientation import Rotation
-from jointfit_simulators.body._posture import MovementStyle, upright
+from jointfit_simulators.body._posture import MovementStyle, upright_pose
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -105,7 +105,7 @@ def motion_from_file(path: Path, style: MovementStyle) -> Motion:
 
     def motion(t: Array) -> Array:
         place = t_s[0] + (t % length if loop else np.clip(t, 0.0, length))
-        coordinates = upright(style, t)
+        coordinates = upright_pose(style, t)
         for part, curve in curves.items():
             coordinates[:, _PARTS[part]] = curve(place)
         return coordinates

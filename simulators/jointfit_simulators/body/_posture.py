@@ -65,7 +65,7 @@ def draw_style(geometry: LegGeometry, random: np.random.Generator) -> MovementSt
     )
 
 
-def upright(style: MovementStyle, t: Array) -> Array:
+def upright_pose(style: MovementStyle, t: Array) -> Array:
     """Return upright stance over the origin, with the plate on its table."""
     return rest(t, style.geometry.standing_pelvis)
 

@@ -227,7 +227,7 @@ class RecordedSubject:
     def _sensor(self, name: str, t_s: Array) -> Array:
         bias = self._recording.biases.get(name)
         still = self._tracks[name].at(_FIRST)[0] if bias is None else bias * [1, -1, -1, -1]
-        return self._blended(self._tracks[name], still, t_s)
+        return self._blend_with_standing(self._tracks[name], still, t_s)
 
     def _bone(self, name: str, t_s: Array) -> tuple[Rotation, Array]:
         turns, origins = self._bones[name]
@@ -237,9 +237,9 @@ class RecordedSubject:
         standing = self._standing_origins[name]
         origin = share[:, None] * origins.at(place) + (1 - share[:, None]) * standing
         origin[self._synthetic(t_s)] = np.nan
-        return from_wxyz(self._blended(turns, still, t_s)), origin
+        return from_wxyz(self._blend_with_standing(turns, still, t_s)), origin
 
-    def _blended(self, track: InterpolatedTrack, still: Array, t_s: Array) -> Array:
+    def _blend_with_standing(self, track: InterpolatedTrack, still: Array, t_s: Array) -> Array:
         """Blend a track with its value while standing, along the shortest arc."""
         place, share = self._place(t_s)
         moving = track.at(place)

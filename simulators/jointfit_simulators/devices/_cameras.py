@@ -104,7 +104,7 @@ class Cameras:
         n = len(observation.markers)
         markers: Array = observation.markers @ self.world.as_matrix().T
         markers = markers + self._random.standard_normal(markers.shape) * self._noise_m
-        markers[self._occluded(n)] = np.nan
+        markers[self._occlusion(n)] = np.nan
         markers[:, [self.markers.index(name) for name in self._absent]] = np.nan
         markers = markers[:, self._labels]
 
@@ -123,7 +123,7 @@ class Cameras:
         positions, orientations = zip(*bodies, strict=True)
         return CameraFrames(markers, np.stack(positions, axis=1), np.stack(orientations, axis=1))
 
-    def _occluded(self, n: int) -> NDArray[np.bool_]:
+    def _occlusion(self, n: int) -> NDArray[np.bool_]:
         """Return whether each marker is occluded, shape (n, markers).
 
         The occlusion is a two-state Markov chain.

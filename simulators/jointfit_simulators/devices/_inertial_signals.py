@@ -61,20 +61,20 @@ class InertialSignals:
         x, y, z = self._turn
         step_s = self._step_s
         true = (x / step_s, y / step_s, z / step_s) if step_s > 0.0 else (0.0, 0.0, 0.0)
-        return self._measured(true, self._errors.gyroscope)
+        return self._measure(true, self._errors.gyroscope)
 
     @property
     def force(self) -> Vector:
         """Specific force, sensor axes, m/s^2."""
-        return self._measured(_to_sensor(self._q, (0.0, 0.0, GRAVITY)), self._errors.accelerometer)
+        return self._measure(_to_sensor(self._q, (0.0, 0.0, GRAVITY)), self._errors.accelerometer)
 
     @property
     def field(self) -> Vector:
         """Magnetic field in sensor axes, with magnitude 1."""
         true = _to_sensor(self._q, (0.0, cos(DIP_RAD), -sin(DIP_RAD)))
-        return self._measured(true, self._errors.magnetometer)
+        return self._measure(true, self._errors.magnetometer)
 
-    def _measured(self, true: Vector, errors: VectorErrors) -> Vector:
+    def _measure(self, true: Vector, errors: VectorErrors) -> Vector:
         return true if self._exact else errors.measure(true, self._random)
 
     def value(self, item: int) -> tuple[float, ...] | None:
@@ -85,21 +85,21 @@ class InertialSignals:
             case Item.RATE_OF_TURN:
                 return self.rate
             case Item.DELTA_Q:
-                x, y, z = self._turn if self._exact else _scaled(self.rate, step_s)
+                x, y, z = self._turn if self._exact else _scale(self.rate, step_s)
                 angle = sqrt(x * x + y * y + z * z)
                 scale = sin(angle / 2.0) / angle if angle > TINY else 0.5
                 return (cos(angle / 2.0), scale * x, scale * y, scale * z)
             case Item.ACCELERATION:
                 return self.force
             case Item.DELTA_V:
-                return _scaled(self.force, step_s)
+                return _scale(self.force, step_s)
             case Item.MAGNETIC_FIELD:
                 return self.field
             case _:
                 return None
 
 
-def _scaled(vector: Vector, scale: float) -> Vector:
+def _scale(vector: Vector, scale: float) -> Vector:
     return (vector[0] * scale, vector[1] * scale, vector[2] * scale)
 
 

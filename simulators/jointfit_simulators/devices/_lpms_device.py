@@ -203,7 +203,7 @@ class LpmsDevice(SerialDevice):
             return False
         if part.rate_hz is not None and part.rate_hz not in self._table.rates_hz:
             return False
-        self.configuration = self.configuration.updated(part)
+        self.configuration = self.configuration.merge(part)
         return True
 
     def _harm(self, command: int) -> bool:

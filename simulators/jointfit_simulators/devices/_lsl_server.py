@@ -122,10 +122,12 @@ class LslServer:
         values: list[float] = []
         for name in self.options.markers:
             at = markers.get(name)
-            values += self._scaled(at) if at is not None else (absent,) * 3
+            values += self._scale_values(at) if at is not None else (absent,) * 3
         for name in self.options.bodies:
             pose = bodies.get(name)
-            values += (*self._scaled(pose[0]), *self._turn(*pose[1])) if pose else (absent,) * 7
+            values += (
+                (*self._scale_values(pose[0]), *self._turn(*pose[1])) if pose else (absent,) * 7
+            )
 
         exposed_ns = exposure_host_ns or time.monotonic_ns()
         stamp_s = self.options.device_ns(exposed_ns) / _NS + self._difference_s
@@ -136,7 +138,7 @@ class LslServer:
         self.number += 1
         self.sent += 1
 
-    def _scaled(self, at: tuple[float, float, float]) -> tuple[float, ...]:
+    def _scale_values(self, at: tuple[float, float, float]) -> tuple[float, ...]:
         return tuple(self._scale * value for value in self._place(*at))
 
     def _info(self) -> Any:

@@ -160,7 +160,7 @@ class NatNetFrameBuilder:
             stamps.transmit,
             stamps.params,
             bodies=tuple(self._body(body, bodies.get(body.name)) for body in self.bodies),
-            markers=tuple(m for body in self.bodies for m in self._labeled(body, markers)),
+            markers=tuple(m for body in self.bodies for m in self._labeled_markers(body, markers)),
             marker_sets=(*sets, every),
             other_markers=tuple(self._markers[name] for name in loose),
         )
@@ -175,7 +175,7 @@ class NatNetFrameBuilder:
         last = {name: self._markers[name] for name in shown if name in self._markers}
         return MarkerSet(body.name, tuple(last.get(name, _ORIGIN) for name in body.markers))
 
-    def _labeled(self, body: RigidBodyAsset, markers: Markers) -> list[LabeledMarker]:
+    def _labeled_markers(self, body: RigidBodyAsset, markers: Markers) -> list[LabeledMarker]:
         labeled = []
         for member, name in enumerate(body.markers, 1):
             visible = markers.get(name) is not None

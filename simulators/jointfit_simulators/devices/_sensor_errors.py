@@ -33,12 +33,12 @@ class VectorErrors:
             sum(map(mul, row, true)) + bias + self._noise(random)
             for row, bias in zip(self.matrix, self.bias, strict=True)
         )
-        return (self._limited(x), self._limited(y), self._limited(z))
+        return (self._limit(x), self._limit(y), self._limit(z))
 
     def _noise(self, random: Random) -> float:
         return random.gauss(0.0, self.noise_sd) if self.noise_sd else 0.0
 
-    def _limited(self, value: float) -> float:
+    def _limit(self, value: float) -> float:
         return min(max(value, -self.limit), self.limit)
 
 

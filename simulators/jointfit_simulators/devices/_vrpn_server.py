@@ -109,7 +109,7 @@ class VrpnServer:
         """Answer requests until cancelled."""
         self.ready.set()
         try:
-            await self._port.serve(self._connected, self._announced)
+            await self._port.serve(self._accept_connection, self._connect_back)
         finally:
             self.ready.clear()
             self._disconnect_all()
@@ -170,7 +170,7 @@ class VrpnServer:
         for tracker, message in messages:
             if tracker not in client.described:
                 self._describe(client, tracker)
-            data = self._encoded(client, message)
+            data = self._encode(client, message)
             if self._random.random() < self.options.hostile:
                 data = _I32_MAX + data[4:]
             if len(datagrams[-1]) + len(data) > _MOST_DATAGRAM:
@@ -200,13 +200,13 @@ class VrpnServer:
 
     # --- connections --------------------------------------------------------------------------
 
-    def _announced(self, data: bytes, address: Address) -> None:
+    def _connect_back(self, data: bytes, address: Address) -> None:
         """Connect to a client that announced a classic connection, at the host of its datagram."""
         announcement = decode_announcement(data)
         if not isinstance(announcement, CorruptBytes) and "classic" in self.options.connections:
             self._port.connect_back((address[0], announcement.port))
 
-    def _connected(self, connected: socket.socket) -> None:
+    def _accept_connection(self, connected: socket.socket) -> None:
         back = connected.getsockname()[1] != self.command_port
         if not back and "tcp" not in self.options.connections:
             connected.close()
@@ -231,14 +231,14 @@ class VrpnServer:
                     if name in self._senders:
                         now_us = time.time_ns() // 1000
                         pong = Pong(now_us, self._senders[name])
-                        peer.send(self._encoded(client, pong))
+                        peer.send(self._encode(client, pong))
 
     def _greet(self, client: _VrpnClient) -> None:
         """Send all descriptions to a new client."""
         descriptions: list[VrpnContent] = [SenderDescription(0, _CONTROL)]
         descriptions += [TypeDescription(number, name) for name, number in self._types.items()]
         for description in descriptions:
-            client.peer.send(self._encoded(client, description))
+            client.peer.send(self._encode(client, description))
         if not self.options.described_late:
             for tracker in self._senders:
                 self._describe(client, tracker)
@@ -247,9 +247,9 @@ class VrpnServer:
     def _describe(self, client: _VrpnClient, tracker: str) -> None:
         client.described.add(tracker)
         description = SenderDescription(self._senders[tracker], tracker)
-        client.peer.send(self._encoded(client, description))
+        client.peer.send(self._encode(client, description))
 
-    def _encoded(self, client: _VrpnClient, message: VrpnContent) -> bytes:
+    def _encode(self, client: _VrpnClient, message: VrpnContent) -> bytes:
         client.sequence += 1
         return encode(message, self._types, sequence=client.sequence)
 

@@ -284,7 +284,7 @@ class XbusDevice(SerialDevice):
         wanted = setup.decode_outputs(data)
         if wanted is None or len(wanted) > _MOST_OUTPUTS:
             return XbusMessageId.ERROR, _INVALID
-        if not all(map(_supported, wanted)):
+        if not all(map(_is_supported, wanted)):
             return XbusMessageId.ERROR, _PARAMETER
         if wanted:
             self.outputs = tuple(map(_effective, wanted))
@@ -356,7 +356,7 @@ def _value(
     return inertial.value(data_id & 0xFFF0) or (0.0,) * count
 
 
-def _supported(output: setup.Output) -> bool:
+def _is_supported(output: setup.Output) -> bool:
     """Return whether the device supports this output at this rate."""
     if output.rate not in {0, setup.MAX_RATE} and output.rate > FILTER_RATE_HZ:
         return False

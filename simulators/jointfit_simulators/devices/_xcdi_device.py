@@ -98,7 +98,7 @@ class XcdiDevice(CanDevice):
         counter, self.counter = self.counter, (self.counter + 1) % COUNTER_MODULUS
         tick_ns = TICK_NS[self._options.sample_time_unit]
         ticks = self._options.first_tick + (device_ns - self._epoch_ns) // tick_ns
-        if self._lost(None):
+        if self._is_lost(None):
             return []
 
         ids = self._options.ids
@@ -111,7 +111,7 @@ class XcdiDevice(CanDevice):
         return [
             self._frame(number, encode(data_id, counts, self._options.byte_order))
             for data_id, number, counts in group
-            if number is not None and not self._lost(data_id)
+            if number is not None and not self._is_lost(data_id)
         ]
 
     def lose(self, count: int) -> None:
@@ -133,7 +133,7 @@ class XcdiDevice(CanDevice):
         """Interrupt the power supply; clock and counter restart."""
         self._epoch_ns, self.counter = self._last_ns, self._options.first_counter
 
-    def _lost(self, data_id: DataId | None) -> bool:
+    def _is_lost(self, data_id: DataId | None) -> bool:
         left = self._to_lose.get(data_id, 0)
         if left:
             self._to_lose[data_id] = left - 1

@@ -60,7 +60,7 @@ class RecordedXbusDevice(XbusDevice):
             messages = [item for item in codec.feed(data) if isinstance(item, XbusMessage)]
             answers = [one for one in messages if one.mid != XbusMessageId.MT_DATA2]
             for answer in answers:
-                options = _configured(options, answer)
+                options = _with_settings(options, answer)
             measurements = data
             if answers:  # handshake: keep its measurements only
                 measurements = b"".join(
@@ -83,7 +83,7 @@ class RecordedXbusDevice(XbusDevice):
             self.sent += self._line.write(data)
 
 
-def _configured(options: XbusDeviceOptions, answer: XbusMessage) -> XbusDeviceOptions:
+def _with_settings(options: XbusDeviceOptions, answer: XbusMessage) -> XbusDeviceOptions:
     """Return the options with the setting that a recorded answer of the device contains."""
     match answer.mid:
         case XbusMessageId.DEVICE_ID:

@@ -56,7 +56,7 @@ class PlayDirectory:
         if asked is not None:
             if asked not in _PORTS:
                 raise PortInUseError(f"--command-port {asked}: expected 1 to {_PORTS[-1]}")
-            if why := _taken(asked):
+            if why := _occupied_reason(asked):
                 raise PortInUseError(
                     f"--command-port {asked}: cannot open UDP {LOOPBACK}:{asked} ({why}): select"
                     f" another, or stop the program that uses it (ss -ulnp 'sport = {asked}')"
@@ -64,7 +64,7 @@ class PlayDirectory:
             return asked
 
         before = self._before.get("command_port")
-        if isinstance(before, int) and before in _PORTS and not _taken(before):
+        if isinstance(before, int) and before in _PORTS and not _occupied_reason(before):
             return before
         return 0
 
@@ -111,7 +111,7 @@ def _state(file: int) -> dict[str, object]:
     return {}
 
 
-def _taken(port: int) -> str | None:
+def _occupied_reason(port: int) -> str | None:
     """Return the reason why `port` cannot be bound, or None."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:

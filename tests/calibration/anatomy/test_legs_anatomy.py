@@ -83,7 +83,7 @@ def test_the_pelvis_begins_between_the_hips_and_points_from_left_to_right() -> N
 
 
 def test_the_guide_asks_for_the_movements_of_both_legs() -> None:
-    status = MovementGuide(LEGS, CalibrationSettings(), None).look({}, 1.0)
+    status = MovementGuide(LEGS, CalibrationSettings(), None).update({}, 1.0)
     lacking = [text.partition(":")[0] for text in status.missing]
     assert lacking == ["right_hip", "right_knee", "left_hip", "left_knee"]
     assert status.joints["pelvis_origin"]["source"] == "midpoint"

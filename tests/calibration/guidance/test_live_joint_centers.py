@@ -62,11 +62,11 @@ def watched(
 ) -> MovementStatus:
     """Return the last status of a movement; require finite values in all payloads."""
     guide = MovementGuide(CHAIN, settings, static)
-    look = guide.look({}, 0.0)
+    look = guide.update({}, 0.0)
     for i, frame in enumerate(frames(track, positions)):
         guide.add_mocap(frame)
         if i % EVERY == 0:
-            look = guide.look({}, i / 120)
+            look = guide.update({}, i / 120)
             json.dumps({"joints": look.joints, "parts": look.parts}, allow_nan=False)
     return look
 
@@ -206,18 +206,18 @@ def test_a_frame_without_markers_or_with_other_names_is_no_frame() -> None:
     )
     for _ in range(400):
         guide.add_mocap(nothing)
-    assert "check the names" in most_urgent(guide.look({}, 3.0).missing)
+    assert "check the names" in most_urgent(guide.update({}, 3.0).missing)
     for frame in frames(track):
         guide.add_mocap(frame)
-    looks = [guide.look({}, 30.0) for _ in range(3)]
+    looks = [guide.update({}, 30.0) for _ in range(3)]
     assert looks[-1].joints["hip"]["source"] == "markers"
 
 
 def test_an_end_joint_without_markers_has_its_configured_length_or_nothing() -> None:
     chain = replace(CHAIN, distal=None, lengths=(None, 0.4))
     static, _ = trials()
-    look = MovementGuide(chain, SETTINGS, static).look({}, 0.0)
+    look = MovementGuide(chain, SETTINGS, static).update({}, 0.0)
     assert look.joints["ankle"]["source"] == "configured"
     assert look.joints["ankle"]["met"] is True, "it cannot be estimated, so it is not waited for"
     unknown = MovementGuide(replace(chain, lengths=()), SETTINGS, static)
-    assert unknown.look({}, 0.0).joints["ankle"]["source"] == "unknown"
+    assert unknown.update({}, 0.0).joints["ankle"]["source"] == "unknown"

@@ -19,7 +19,11 @@ from jointfit_daemon.calibration.marker_refinement import (
     refine_markers,
 )
 from jointfit_daemon.calibration.marker_refinement._objective import RefinementProblem
-from jointfit_daemon.calibration.marker_refinement._simultaneous import errors, place, solve_jointly
+from jointfit_daemon.calibration.marker_refinement._simultaneous import (
+    errors,
+    place,
+    solve_simultaneously,
+)
 from jointfit_daemon.kinematics.chains import (
     ChainModel,
     ChainState,
@@ -101,7 +105,7 @@ def test_the_step_is_that_of_the_whole_least_squares_problem() -> None:
         return np.concatenate((errors(problem, positions, state).ravel(), pull.ravel()))
 
     whole = least_squares(residuals, np.zeros(free.sum() + len(y) * model.nq), xtol=1e-12)
-    ended = solve_jointly(problem, start, tolerance=1e-12)[-1]
+    ended = solve_simultaneously(problem, start, tolerance=1e-12)[-1]
     assert ended.cost == pytest.approx(whole.cost, rel=1e-6)
     np.testing.assert_allclose(
         ended.positions[free] - model.positions[free], whole.x[: free.sum()], atol=1e-5
@@ -195,7 +199,7 @@ def test_both_methods_find_the_same_within_limits() -> None:
 
 def test_trials_are_thinned_evenly_and_split_in_two_runs_of_frames() -> None:
     trial = MotionTrial("a", np.arange(100.0)[:, None, None] * np.ones((1, 2, 3)), 100.0)
-    thin = trial.thinned(30)
+    thin = trial.thin(30)
     np.testing.assert_array_equal(thin.targets[:, 0, 0], np.arange(0.0, 100.0, 4.0))
     assert thin.rate_hz == 25.0
     first, last = trial.split(0.25)

@@ -83,7 +83,7 @@ def test_the_guide_names_an_exchange_within_three_seconds(labels: tuple[str, ...
         layout, none = MocapLayout(LABELS, ()), np.zeros((0, 3))
         for k, points in enumerate(positions[:360]):
             guide.add_mocap(MocapFrame(0, k, None, layout, points, none, np.zeros((0, 4))))
-        return " ".join(guide.look({}, 3.0).missing)
+        return " ".join(guide.update({}, 3.0).missing)
 
     functional = trials()[1].optical
     assert functional is not None

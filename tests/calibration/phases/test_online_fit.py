@@ -11,7 +11,7 @@ import pytest
 from jointfit_daemon.calibration import CalibrationError, OnlineFrames, RefitJob
 from jointfit_daemon.calibration.phases import refit_models, run_job
 from jointfit_daemon.calibration.record._content_check import content_faults
-from jointfit_daemon.calibration.soft_tissue import evenly, joined, pack, unpack
+from jointfit_daemon.calibration.soft_tissue import join_training, pack, thin_evenly, unpack
 from jointfit_daemon.calibration.soft_tissue._training_memory import MOST, postures
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.limb_model import Calibration
@@ -97,7 +97,7 @@ def test_few_frames_are_refused() -> None:
 
 
 def test_memory_keeps_orientations_to_a_hundredth_of_a_degree() -> None:
-    taught = joined(moving(50, 0.5), moving(40, 1.0))
+    taught = join_training(moving(50, 0.5), moving(40, 1.0))
     again = unpack(CHAIN, pack(CHAIN, taught))
     assert again is not None
     for name, q in {**taught.sensors, **taught.reference}.items():
@@ -115,7 +115,7 @@ def test_memory_of_another_chain_is_none() -> None:
 
 def test_memory_is_bounded_and_retains_rare_postures() -> None:
     rare, common = moving(20, 2.0), moving(5000, 0.3)
-    kept = evenly(CHAIN, joined(rare, common))
+    kept = thin_evenly(CHAIN, join_training(rare, common))
     assert len(kept) == MOST
     assert kept.trials is not None
     assert np.count_nonzero(kept.trials == 0) >= 15
@@ -124,8 +124,8 @@ def test_memory_is_bounded_and_retains_rare_postures() -> None:
 def test_of_one_posture_the_newest_frames_stay() -> None:
     long = moving(1000, 0.0)
     assert len(np.unique(postures(CHAIN, long), axis=0)) < 10
-    both = joined(long, long)
-    kept = evenly(CHAIN, both, 500)
+    both = join_training(long, long)
+    kept = thin_evenly(CHAIN, both, 500)
     assert kept.trials is not None
     assert np.mean(kept.trials == 1) > 0.95
 
@@ -133,7 +133,7 @@ def test_of_one_posture_the_newest_frames_stay() -> None:
 def test_memory_distinguishes_at_most_three_kinds_of_movement() -> None:
     taught = moving(10, 0.5)
     for _ in range(4):
-        taught = joined(taught, moving(10, 0.5))
+        taught = join_training(taught, moving(10, 0.5))
     assert taught.trials is not None
     assert sorted(set(taught.trials.tolist())) == [0, 1, 2]
     assert taught.trials.tolist() == sorted(taught.trials.tolist())

@@ -10,7 +10,7 @@ import pytest
 from jointfit_daemon.calibration.record._content_check import _wrong_types
 from jointfit_daemon.calibration.soft_tissue import SegmentTraining
 from jointfit_daemon.calibration.soft_tissue._kernel_fit import fit_kernel
-from jointfit_daemon.calibration.soft_tissue._kernel_ridge import stacked
+from jointfit_daemon.calibration.soft_tissue._kernel_ridge import stacking_weights
 from jointfit_daemon.calibration.soft_tissue._kernel_trend_fit import fit_trend
 from jointfit_daemon.calibration.soft_tissue._leverage_variance_fit import measure_spread
 from jointfit_daemon.kinematics import rotation as rot
@@ -150,11 +150,11 @@ def test_stacked_shares_are_a_part_of_a_whole() -> None:
     rng = np.random.default_rng(3)
     truth = rng.normal(0, 1, 200)
     predictions = np.stack([truth + rng.normal(0, 0.1, 200), rng.normal(0, 1, 200)], axis=1)
-    shares = stacked(predictions, truth)
+    shares = stacking_weights(predictions, truth)
     assert np.all(shares >= 0)
     assert shares.sum() <= 1.001
     assert shares[0] > 0.9
-    assert np.all(stacked(predictions, rng.normal(0, 1, 200)) < 0.2)
+    assert np.all(stacking_weights(predictions, rng.normal(0, 1, 200)) < 0.2)
 
 
 def test_one_frame_is_that_of_many_wherever_it_lies() -> None:

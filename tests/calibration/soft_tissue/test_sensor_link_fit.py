@@ -54,7 +54,7 @@ def link() -> SensorLink:
 
 def test_link_expects_the_artefact_of_a_trained_posture(link: SensorLink) -> None:
     angle = radians(15.0)
-    (x, y, z), sd = link.expected(tilted(angle), tilted(-angle))
+    (x, y, z), sd = link.predict(tilted(angle), tilted(-angle))
     assert (x, y, z) == pytest.approx((ARTEFACT * angle, 0.0, 0.0), abs=radians(0.2))
     assert radians(0.2) < sd < radians(0.6)
 
@@ -62,10 +62,10 @@ def test_link_expects_the_artefact_of_a_trained_posture(link: SensorLink) -> Non
 def test_standard_deviation_of_a_link_contains_its_error_in_untrained_postures(
     link: SensorLink,
 ) -> None:
-    _, before = link.expected(tilted(radians(15.0)), tilted(radians(-15.0)))
+    _, before = link.predict(tilted(radians(15.0)), tilted(radians(-15.0)))
     for degrees in (40.0, 60.0, 90.0):
         angle = radians(degrees)
-        (x, _, _), sd = link.expected(tilted(angle), tilted(-angle))
+        (x, _, _), sd = link.predict(tilted(angle), tilted(-angle))
         assert sd > 1.5 * before
         assert abs(x - ARTEFACT * angle) < 3.0 * sd
         before = sd
@@ -78,7 +78,7 @@ def test_movement_in_which_residuals_are_alike_leaves_a_link_less_certain() -> N
     slow = np.convolve(random.standard_normal(N + 99), np.ones(100) / 10.0, mode="valid")
     postures = tilted(radians(30.0)), tilted(radians(-30.0))
     sds = [
-        pair_of(thigh, radians(0.5) * noise / np.std(noise)).expected(*postures)[1]
+        pair_of(thigh, radians(0.5) * noise / np.std(noise)).predict(*postures)[1]
         for noise in (white, slow)
     ]
     assert sds[1] > 1.2 * sds[0]

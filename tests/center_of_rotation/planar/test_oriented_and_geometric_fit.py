@@ -19,7 +19,7 @@ from jointfit_daemon.center_of_rotation.planar import (
     geometric_estimate,
     oriented_estimate,
 )
-from jointfit_daemon.center_of_rotation.planar._oriented_fit import guarded
+from jointfit_daemon.center_of_rotation.planar._oriented_fit import limit_center
 
 WIDE = CircleLimits(0.0, (0.0, inf), 0.0, inf)
 values = st.one_of(st.floats(-1.0, 1.0), st.just(nan), st.just(0.0))
@@ -62,7 +62,7 @@ def test_angles_of_another_limb_do_little_harm() -> None:
 @settings(max_examples=40, deadline=None)
 def test_guard_limits_distance_from_the_circle_fit(x: Any, y: Any) -> None:
     circle = fit_circles(arc(90.0)[0])
-    held, covariance, _ = guarded(np.array([x, y]), circle.covariance * 0.1, circle)
+    held, covariance, _ = limit_center(np.array([x, y]), circle.covariance * 0.1, circle)
     away = held - circle.center
     apart = np.linalg.inv(0.9 * circle.covariance)
     assert away @ apart @ away <= (0.7 * 1.05) ** 2

@@ -376,11 +376,11 @@ def test_messages_and_losses_add_up(frames: list[CanFrame]) -> None:
 
 
 def test_identifiers_left_out_move_with_their_block() -> None:
-    assert XcdiIdSettings().resolved() == XcdiIds()
+    assert XcdiIdSettings().resolve() == XcdiIds()
     block = XcdiIdSettings(sample_time=0x105, group_counter=0x106, quaternion=0x121)
-    assert block.resolved() == id_block(0x100)
+    assert block.resolve() == id_block(0x100)
     alone = XcdiIdSettings(sample_time=0x105, group_counter=0x107, quaternion=0x121)
-    assert (alone.resolved().error, alone.resolved().status_word) == (None, None)
+    assert (alone.resolve().error, alone.resolve().status_word) == (None, None)
 
 
 @pytest.mark.parametrize("base", [-1, 0, 1, 0x7DE, 0x7DF, 0x7FE])
@@ -391,7 +391,7 @@ def test_derived_identifiers_never_leave_the_range_of_the_given_ones(base: int) 
         with pytest.raises(ValidationError, match="above 0x7FF, the greatest 11-bit identifier"):
             settings(ids=ids)
     else:
-        found = XcdiIdSettings(**ids).resolved()
+        found = XcdiIdSettings(**ids).resolve()
         assert all(0 <= number <= 0x7FF for number in found[:5] if number is not None)
         assert (found.error is None) == (base < 0)
 

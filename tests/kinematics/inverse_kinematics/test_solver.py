@@ -92,7 +92,7 @@ def test_sums_over_segments_are_the_dense_normal_equations(seed: int) -> None:
     y = marker_positions(model, state) + rng.normal(0.0, 0.1, (3, len(model.markers), 3))
     w = rng.uniform(0.0, 2.0, y.shape[:2])
     slots = marker_slots(model)
-    found = marker_fit(slots, state, slots.filled_vectors(y), slots.filled(w))
+    found = marker_fit(slots, state, slots.vectors_to_slots(y), slots.to_slots(w))
     H, g = normal_equations(slots, found)
     J, e = jacobian(model, state), marker_positions(model, state) - y
     np.testing.assert_allclose(H, np.einsum("tmik,tm,tmil->tkl", J, w, J), atol=1e-10)

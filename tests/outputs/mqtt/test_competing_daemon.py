@@ -279,7 +279,7 @@ def test_daemon_that_gave_way_does_so_again_after_a_restart_of_the_broker(gap_s:
     paused, other = TakeoverDetector(), TakeoverDetector()
     assert not other.suspects(3600.0, taken_over=False)
     assert not paused.suspects(3600.0, taken_over=False)
-    paused.give_way()
+    paused.restart_count()
     assert not other.suspects(0.0, taken_over=False)  # no broker
     assert takeovers(other, gap_s + 0.01, 0.02, reason=False)[-1] == 1
     assert paused.suspects(0.1, taken_over=True)

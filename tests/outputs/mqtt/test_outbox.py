@@ -51,7 +51,7 @@ async def test_reconnect_sends_all_state_again_and_bridge_state_last() -> None:
     for topic in ("z", LIFE, "a"):
         outbox.retain(topic, b"1")
     await drain(outbox)
-    outbox.reconnected()
+    outbox.requeue_state()
     assert [topic for topic, _, _ in await drain(outbox)] == ["z", "a", LIFE]
 
 
@@ -77,7 +77,7 @@ async def test_reconnect_drops_and_counts_waiting_streams() -> None:
     outbox = Outbox(LIFE)
     outbox.stream("pose", b"old")
     outbox.event("event", b"kept")
-    outbox.reconnected()
+    outbox.requeue_state()
     assert [payload for _, payload, _ in await drain(outbox)] == [b"kept"]
     assert outbox.dropped == 1
 
@@ -93,7 +93,7 @@ async def test_unacknowledged_responses_and_events_are_sent_again_in_order() -> 
     assert outbox.has_unsent
     given[2][1]()  # event 1 is acknowledged before event 0 and the response
     outbox.event("bridge/event", b"4")
-    outbox.reconnected()
+    outbox.requeue_state()
     assert [payload for _, payload, _ in await drain(outbox)] == [b"r", b"0", b"2", b"3", b"4"]
     assert outbox.dropped == 1  # the pose
     assert not outbox.has_unsent
@@ -114,7 +114,7 @@ async def test_cleared_topic_is_sent_empty_once() -> None:
     await drain(outbox)
     outbox.retain("device/S1/info", b"")
     assert await drain(outbox) == [("device/S1/info", b"", True)]
-    outbox.reconnected()
+    outbox.requeue_state()
     assert await drain(outbox) == []
 
 
@@ -128,7 +128,7 @@ async def test_every_message_is_sent_waiting_or_counted_as_dropped(
             wanted[topic] = payload
             outbox.retain(topic, payload)
         elif action == "reconnect":
-            outbox.reconnected()
+            outbox.requeue_state()
         elif action not in {"send", "lose"}:
             given_out += 1
             getattr(outbox, action)(topic, payload)
@@ -138,7 +138,7 @@ async def test_every_message_is_sent_waiting_or_counted_as_dropped(
                 done()
                 sent += not message.retain
     at_broker = {}
-    outbox.reconnected()
+    outbox.requeue_state()
     while outbox.queued:
         message, done = await outbox.next()
         done()

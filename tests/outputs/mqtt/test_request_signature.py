@@ -24,7 +24,7 @@ from jointfit_daemon.outputs.mqtt import (
     SignatureRejectedError,
     verify,
 )
-from jointfit_daemon.outputs.mqtt._signature import canonical, signature_of, signed
+from jointfit_daemon.outputs.mqtt._signature import canonical, sign_request, signature_of
 from jointfit_daemon.pipeline.events import Reply, Request
 from jointfit_daemon.supervisor.requests import RequestAuthenticator, parse_request
 
@@ -54,7 +54,7 @@ def now_us() -> int:
 
 @given(requests)
 def test_signed_request_is_verified(request: dict[str, Any]) -> None:
-    sent = orjson.loads(orjson.dumps(signed(KEY, TOPIC, request)))
+    sent = orjson.loads(orjson.dumps(sign_request(KEY, TOPIC, request)))
     nonce, t_us = verify(KEY, TOPIC, sent, now_us())
     assert (nonce, t_us) == (sent["nonce"], sent["t_us"])
 
@@ -87,14 +87,14 @@ def test_the_signature_is_plain_hmac_sha256_of_topic_and_sorted_json(
     ],
 )
 def test_a_changed_request_is_refused(change: Callable[[dict[str, Any]], None], told: str) -> None:
-    sent = signed(KEY, TOPIC, ASKED)
+    sent = sign_request(KEY, TOPIC, ASKED)
     change(sent)
     with pytest.raises(SignatureRejectedError, match=told):
         verify(KEY, TOPIC, sent, now_us())
 
 
 def test_another_key_and_another_topic_are_refused() -> None:
-    sent = signed(KEY, TOPIC, ASKED)
+    sent = sign_request(KEY, TOPIC, ASKED)
     for key, topic in ((KEY[::-1], TOPIC), (KEY, TOPIC.replace("bench-1", "bench-2"))):
         with pytest.raises(SignatureRejectedError, match="another key, for another topic"):
             verify(key, topic, sent, now_us())
@@ -104,7 +104,7 @@ def test_another_key_and_another_topic_are_refused() -> None:
     ("off_us", "told"), [(SIGNATURE_LIFETIME_US + 1, "old"), (-SIGNATURE_LIFETIME_US - 1, "ahead")]
 )
 def test_an_old_or_future_request_is_refused(off_us: int, told: str) -> None:
-    sent = signed(KEY, TOPIC, ASKED)
+    sent = sign_request(KEY, TOPIC, ASKED)
     verify(
         KEY,
         TOPIC,
@@ -116,7 +116,7 @@ def test_an_old_or_future_request_is_refused(off_us: int, told: str) -> None:
 
 
 def test_signed_request_is_accepted_once(guard: RequestAuthenticator) -> None:
-    sent = signed(KEY, TOPIC, ASKED)
+    sent = sign_request(KEY, TOPIC, ASKED)
     assert guard.check(TOPIC, sent) == ASKED
     with pytest.raises(SignatureRejectedError, match="used already"):
         guard.check(TOPIC, sent)
@@ -124,7 +124,7 @@ def test_signed_request_is_accepted_once(guard: RequestAuthenticator) -> None:
 
 def test_request_signed_before_the_start_is_refused(tmp_path: Path) -> None:
     (tmp_path / "key").write_bytes(KEY)
-    sent = signed(KEY, TOPIC, ASKED)
+    sent = sign_request(KEY, TOPIC, ASKED)
     time.sleep(0.001)
     late = RequestAuthenticator(MqttSettings(request_key_file=str(tmp_path / "key")))
     with pytest.raises(SignatureRejectedError, match="before the daemon started"):
@@ -136,17 +136,17 @@ def test_nonce_memory_is_limited_and_expires(
 ) -> None:
     monkeypatch.setattr("jointfit_daemon.supervisor.requests._authentication.NONCE_CAPACITY", 3)
     for _ in range(3):
-        guard.check(TOPIC, signed(KEY, TOPIC, ASKED))
+        guard.check(TOPIC, sign_request(KEY, TOPIC, ASKED))
     with pytest.raises(SignatureRejectedError, match="more than 3 requests"):
-        guard.check(TOPIC, signed(KEY, TOPIC, ASKED))
+        guard.check(TOPIC, sign_request(KEY, TOPIC, ASKED))
     monkeypatch.setattr("jointfit_daemon.supervisor.requests._authentication._NONCE_LIFETIME_NS", 0)
-    guard.check(TOPIC, signed(KEY, TOPIC, ASKED))
+    guard.check(TOPIC, sign_request(KEY, TOPIC, ASKED))
 
 
 def test_without_a_key_in_the_rig_signatures_are_not_needed() -> None:
     guard = RequestAuthenticator(MqttSettings())
     assert guard.check(TOPIC, ASKED) == ASKED
-    assert guard.check(TOPIC, signed(KEY, TOPIC, ASKED)) == ASKED
+    assert guard.check(TOPIC, sign_request(KEY, TOPIC, ASKED)) == ASKED
 
 
 @pytest.mark.parametrize("content", [None, b"short"])
@@ -156,7 +156,7 @@ def test_missing_key_refuses_all_requests(tmp_path: Path, content: bytes | None)
         path.write_bytes(content)
     guard = RequestAuthenticator(MqttSettings(request_key_file=str(path)))
     assert "request_key_file" in guard.fault
-    for request in (ASKED, signed(b"short", TOPIC, ASKED)):
+    for request in (ASKED, sign_request(b"short", TOPIC, ASKED)):
         with pytest.raises(SignatureRejectedError, match="no key to check"):
             guard.check(TOPIC, request)
 
@@ -169,7 +169,7 @@ def test_credential_takes_precedence_over_the_key_file(
     (tmp_path / "credentials" / "key").write_bytes(KEY)
     monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path / "credentials"))
     guard = RequestAuthenticator(MqttSettings(request_key_file=str(tmp_path / "key")))
-    assert guard.check(TOPIC, signed(KEY, TOPIC, ASKED)) == ASKED
+    assert guard.check(TOPIC, sign_request(KEY, TOPIC, ASKED)) == ASKED
 
 
 def asked(guard: RequestAuthenticator, request: dict[str, Any]) -> Request | Reply | None:
@@ -179,7 +179,7 @@ def asked(guard: RequestAuthenticator, request: dict[str, Any]) -> Request | Rep
 def test_daemon_accepts_signed_requests_and_refuses_others(
     guard: RequestAuthenticator,
 ) -> None:
-    good = asked(guard, signed(KEY, TOPIC, ASKED))
+    good = asked(guard, sign_request(KEY, TOPIC, ASKED))
     assert isinstance(good, Request)
     assert good.arguments == {"phase": "static", "force": False}  # no trace of the signature
     refused = asked(guard, ASKED)

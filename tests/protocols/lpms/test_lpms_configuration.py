@@ -119,14 +119,14 @@ def test_settings_read_as_they_were_sent(table: CommandTable, data: st.DataObjec
         reply = encode_configuration(table, command, sent)
         part = decode_configuration(table, command, reply)
         assert part is not None
-        found = found.updated(part)
+        found = found.merge(part)
     assert found == sent
 
     made = LpmsConfiguration()
     for command, value in set_command(table, sent):
         part = decode_set(table, command, value)
         assert part is not None
-        made = made.updated(part)
+        made = made.merge(part)
     assert made == sent
 
 

@@ -78,7 +78,7 @@ class Wired:
             self._tie()
 
     def _tie(self) -> None:
-        for u, v in self.line.matched("imu"):
+        for u, v in self.line.match_edges("imu"):
             self.imu.feed_sync_edge(u, v, self.server)
 
     def sample(self, t: int) -> None:

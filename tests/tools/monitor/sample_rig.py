@@ -234,7 +234,7 @@ def connected_state(**options: Any) -> MonitorState:
     """Return the state of a monitor that is connected and has chosen its rig."""
     state = MonitorState("localhost:1883", timezone=UTC, **options)
     state.begin_rig(BASE)
-    state.connected()
+    state.set_connected()
     return state
 
 

@@ -51,7 +51,7 @@ def offline() -> MonitorState:
 
 def broker_lost() -> MonitorState:
     state = live()
-    state.lost("broker localhost:1883: connection refused: start the broker, or correct host")
+    state.set_lost("broker localhost:1883: connection refused: start the broker, or correct host")
     return state
 
 
@@ -118,7 +118,7 @@ def log() -> MonitorState:
 
 def several_rigs() -> MonitorState:
     state = MonitorState("localhost:1883")
-    state.found_rigs({"jointfit/left": "left leg", "jointfit/right": "right leg"})
+    state.set_found_rigs({"jointfit/left": "left leg", "jointfit/right": "right leg"})
     return state
 
 

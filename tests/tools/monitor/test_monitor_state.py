@@ -124,12 +124,12 @@ def test_the_angle_is_chosen_in_the_order_of_the_joints() -> None:
 
 def test_one_rig_is_chosen_and_several_are_offered() -> None:
     state = MonitorState("broker")
-    state.connected()
-    assert state.found_rigs({"jointfit/a": "A"}) == "jointfit/a"
-    assert state.found_rigs({"jointfit/b": "B", "jointfit/a": "A"}) is None
+    state.set_connected()
+    assert state.set_found_rigs({"jointfit/a": "A"}) == "jointfit/a"
+    assert state.set_found_rigs({"jointfit/b": "B", "jointfit/a": "A"}) is None
     state.press("down")
     assert state.press("enter") == ChooseRig("jointfit/b")
-    assert state.found_rigs({}) is None
+    assert state.set_found_rigs({}) is None
     assert state.press("enter") is None
 
 

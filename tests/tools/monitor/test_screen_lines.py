@@ -143,12 +143,12 @@ def test_a_limitation_is_a_sentence(flags: tuple[str, ...], expected: str) -> No
 
 def test_lost_broker_and_stopped_daemon_are_told_apart() -> None:
     state = live_state(SampleRig(), 3.0)
-    state.lost("broker localhost:1883: connection refused: start the broker")
+    state.set_lost("broker localhost:1883: connection refused: start the broker")
     found = words(state)
     assert "Broker lost" in found
     assert "start the broker" in found
     assert "jointfitd is not running" not in found
-    state.connected()
+    state.set_connected()
     take(state, "bridge/state", {"v": 1, "state": "offline"})
     found = words(state)
     assert "✖ jointfitd is not running" in found
@@ -283,7 +283,7 @@ def test_long_views_scroll_and_state_how_much_follows() -> None:
 
 def test_several_rigs_are_offered() -> None:
     state = MonitorState("localhost:1883")
-    state.found_rigs({"jointfit/a": "left leg", "jointfit/b": "right leg"})
+    state.set_found_rigs({"jointfit/a": "left leg", "jointfit/b": "right leg"})
     assert "▶ left leg (jointfit/a)" in words(state)
     assert "Enter show" in words(state)
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jointfit_daemon.physical_test._frame_judgement import explain_frames, fit_frames
+from jointfit_daemon.physical_test._frame_evaluation import explain_frames, fit_frames
 from jointfit_daemon.physical_test._rest_finder import MOVED_RAD, REST_S, RestFinder
 
 if TYPE_CHECKING:
