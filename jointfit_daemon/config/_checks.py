@@ -474,15 +474,15 @@ def rig_warnings(rig: Rig) -> list[str]:
 def _numbers(ids: object) -> Iterator[tuple[str, int]]:
     """Yield the message names and identifiers of an ``ids`` table, which is a model or a dict.
 
-    A model whose identifiers depend on each other has a method ``resolved``.
+    A model whose identifiers depend on each other has a method ``resolve``.
     """
-    resolved = getattr(ids, "resolved", None)
+    resolve = getattr(ids, "resolve", None)
     fields = type(ids).model_fields if isinstance(ids, BaseModel) else {}
     faulty = any(
         field.default is not None and getattr(ids, name) is None for name, field in fields.items()
     )
-    if callable(resolved) and not faulty:  # never derive identifiers from a wrong one
-        ids = resolved()
+    if callable(resolve) and not faulty:  # never derive identifiers from a wrong one
+        ids = resolve()
     if isinstance(ids, BaseModel):
         ids = dict(ids)
     elif isinstance(ids, tuple) and hasattr(ids, "_asdict"):

@@ -81,8 +81,8 @@ class PoseConverter:
 
         bodies, suspicious = self._bodies(frame, binding, unknown)
         places = [bodies.get(key, ABSENT) for key in binding.columns.bodies]
-        residuals = np.array([errors.get(key, np.nan) for key in binding.columns.markers])
-        residuals[~(residuals > 0.0)] = np.nan
+        residuals = np.array(list(map(errors.get, binding.columns.markers)), dtype=np.float64)
+        residuals[residuals <= 0.0] = np.nan  # absent markers are NaN already
 
         return FrameColumns(
             rows_array([seen.get(key, NO_POSITION) for key in binding.columns.markers], 3),
