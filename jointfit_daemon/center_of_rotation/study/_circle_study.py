@@ -163,8 +163,8 @@ def run_study(
 def uniform_arc_rms(arc: float, frames: int, noise: float, *, known_radius: bool = False) -> float:
     r"""Return the Cramér-Rao bound of the RMS error of a circle's center, in closed form, m.
 
-    The points are spread evenly over an arc, and there are many of them. `circle_rms_bound`
-    computes the bound for any points.
+    The points are spread evenly over an arc, and there are many of them. For any points,
+    ``bench.baselines.circle_theory`` computes this bound.
 
     .. math:: E^2 = \frac{\sigma^2}{n} \left[ \frac{2}{1-c} + \frac{2}{1+c-2s^2} \right],
               \quad s = \frac{\sin(\varphi/2)}{\varphi/2}, \quad c = \frac{\sin\varphi}{\varphi}
