@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tests.broker_fixture import chosen_broker
+from tests.faults.peers import compare_with_peers
 from tests.faults.run import PAGE, RESULTS, render, run_all, scenarios, stored, summary
 
 if TYPE_CHECKING:
@@ -25,7 +26,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="make faults", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(known))
     parser.add_argument("--repeat", type=int, default=1, help="runs of each scenario")
+    parser.add_argument(
+        "--peers", action="store_true", help="compare the daemon with gpsd and aiomqtt instead"
+    )
     options = parser.parse_args()
+    if options.peers:
+        return compare_with_peers(options.repeat, store=options.repeat > 1)
     if unknown := set(options.names) - known.keys():
         parser.error(f"unknown: {', '.join(sorted(unknown))}; known: {', '.join(known)}")
 

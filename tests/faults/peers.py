@@ -1,13 +1,11 @@
-"""``python -m tests.faults.peers``: the same faults for the daemon and for other programs.
+"""The same faults for the daemon and for other programs: ``make faults ARGS=--peers``.
 
 A minimal publisher with aiomqtt meets the faults of the broker, and gpsd those of serial input. All
-of them run beside the daemon and meet each fault at the same instant. ``--store`` stores the
-figures and writes docs/reliability.md.
+of them run beside the daemon and meet each fault at the same instant.
 """
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
 import json
@@ -190,23 +188,15 @@ async def compare(folder: Path, repeat: int) -> dict[str, Any]:
     return {"times_s": found, "gpsd_flood": counts}
 
 
-def main() -> int:
-    """Run all faults and print the table; return 1 if a program is faster than the daemon."""
-    parser = argparse.ArgumentParser(prog="python -m tests.faults.peers", description=__doc__)
-    parser.add_argument("--repeat", type=int, default=20, help="runs of each quick fault")
-    parser.add_argument("--store", action="store_true", help="store the figures for the page")
-    options = parser.parse_args()
+def compare_with_peers(repeat: int, *, store: bool) -> int:
+    """Run all faults and print the table; return 1 if a peer recovers sooner than the daemon."""
     with tempfile.TemporaryDirectory() as name:
         Path(name).chmod(0o755)  # as root, gpsd changes to a user of its own
-        results = asyncio.run(compare(Path(name), options.repeat))
+        results = asyncio.run(compare(Path(name), repeat))
     print(table_of(results))
-    if options.store:
+    if store:
         RESULTS.write_text(json.dumps(results, indent=1, sort_keys=True) + "\n", "utf-8")
         PAGE.write_text(render(stored()), "utf-8")
     slower = slower_than_a_peer(results)
     print("\n".join(f"slower than a peer: {fault}" for fault in slower) or "never slower")
     return 1 if slower else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
