@@ -34,6 +34,8 @@ from jointfit_protocols.lpms.configuration import (
 from jointfit_protocols.lpms.measurement import TICK_MODULUS, PacketLayout, seconds_of
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from jointfit_daemon.model import Chunk, Decoded
     from jointfit_drivers.lpms._settings import LpmsSettings
     from jointfit_protocols.lpms.measurement import LpmsMeasurement
@@ -55,6 +57,8 @@ class _Packet(NamedTuple):
     arrival_ns: int
     ticks: int
     measurement: LpmsMeasurement
+    quaternion: Sequence[float]
+    """Values of the quaternion as sent. The outputs may change while the packet is held."""
 
 
 class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
@@ -155,7 +159,8 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
             ]
         device_ns = ticks * 1_000 if self._is_seconds else ticks * _NS // self._ticks_per_s
         step = self._continuity.add(device_ns, arrival_ns)
-        packet = _Packet(message, arrival_ns, ticks, measurement)
+        values = measurement.values[self._layout.places["quaternion"]]
+        packet = _Packet(message, arrival_ns, ticks, measurement, values)
 
         held = self._held
         if not step.restarted:
@@ -187,8 +192,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
     def _sample(self, packet: _Packet) -> list[Decoded]:
         """Return the sample of an accepted packet."""
         measurement = packet.measurement
-        values = measurement.values[self._layout.places["quaternion"]]
-        converted = self._orientation.convert(values, floats=measurement.floats)
+        converted = self._orientation.convert(packet.quaternion, floats=measurement.floats)
         out, self._orientation.events = self._orientation.events, []
 
         if converted is None:
