@@ -86,6 +86,11 @@ def test_a_promise_that_is_broken_or_unknown_is_named(worse: dict[str, object]) 
     assert len(missed_targets(figures(**worse))) == 1
 
 
+def test_samples_without_an_outcome_are_named_by_source_with_the_usual_cause() -> None:
+    (missed,) = missed_targets(figures(unaccounted=5, unaccounted_by_source={"S1": 3, "S4": 2}))
+    assert missed.startswith("unaccounted is 5, expected at most 0 (S1 3, S4 2): other programs")
+
+
 @pytest.mark.parametrize("joint", ["elbow", "lumbar", "right_knee"])
 def test_another_limb_is_judged_by_its_own_joint(joint: str) -> None:
     good = figures()
