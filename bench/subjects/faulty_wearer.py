@@ -38,21 +38,21 @@ PULL_S, STAY_S = 5.0, 30.0
 
 
 @dataclass(frozen=True, slots=True)
-class Worn:
-    """One subject in motion."""
+class SubjectRecording:
+    """Orientations of the sensors and bones of one subject in motion."""
 
     t_s: Array
     """Time from 0, shape (n,), s."""
-    said: Mapping[str, Array]
+    orientations: Mapping[str, Array]
     """Orientations q_world_sensor by sensor, shape (n, 4); NaN without a sample."""
     bones: Mapping[str, Array]
     """Orientations q_optical_segment by segment, shape (n, 4)."""
     flexion: Array
     """Knee flexion, rad."""
 
-    def spoilt(self, name: str, q: Array) -> Worn:
+    def with_orientations(self, name: str, q: Array) -> SubjectRecording:
         """Return a copy in which `q` replaces the samples of one sensor."""
-        return Worn(self.t_s, {**self.said, name: q}, self.bones, self.flexion)
+        return SubjectRecording(self.t_s, {**self.orientations, name: q}, self.bones, self.flexion)
 
 
 @cache
@@ -69,8 +69,8 @@ def calibrated(seed: int) -> Calibration | None:
 
 
 @cache
-def live(seed: int, seconds: float, rate_hz: float, begin_s: float = BEGIN_S) -> Worn:
-    """Return a subject who walks, squats, sits down, stands up and stands, in turn."""
+def live(seed: int, seconds: float, rate_hz: float, begin_s: float = BEGIN_S) -> SubjectRecording:
+    """Return the recording of walking, squats, sitting down and up, and standing, in turn."""
     knobs = Knobs(seed=seed)
     count = -(-int(seconds) // int(MOVE_S))
     steps = [Step(MOVES[k % len(MOVES)], MOVE_S) for k in range(count)]
@@ -78,46 +78,50 @@ def live(seed: int, seconds: float, rate_hz: float, begin_s: float = BEGIN_S) ->
     t_s = np.arange(begin_s, begin_s + seconds, 1 / rate_hz)
     seen = wearer.observe([t_s] * len(SENSORS), np.empty(0), t_s)
     world = Cameras(knobs, wearer, rate_hz=knobs.mocap_hz).world
-    said = {
+    orientations = {
         name: OrientationSensor(knobs, name).report(t_s, q)
         for name, q in zip(SENSORS, seen.sensors, strict=True)
     }
     bones = {name: to_wxyz(world * seen.truth.orientations[name]) for name in SEGMENTS}
-    return Worn(t_s - begin_s, said, bones, seen.truth.angles[:, 0])
+    return SubjectRecording(t_s - begin_s, orientations, bones, seen.truth.angles[:, 0])
 
 
-def stuck(person: Worn, name: str, at_s: float) -> Worn:
-    """Return the subject with a sensor that repeats its last orientation."""
-    q = person.said[name]
+def stuck(person: SubjectRecording, name: str, at_s: float) -> SubjectRecording:
+    """Return a copy in which a sensor repeats its last orientation from `at_s` on."""
+    q = person.orientations[name]
     first = int(np.searchsorted(person.t_s, at_s))
-    return person.spoilt(name, np.where(np.arange(len(q))[:, None] < first, q, q[first]))
+    return person.with_orientations(name, np.where(np.arange(len(q))[:, None] < first, q, q[first]))
 
 
-def silent(person: Worn, name: str, at_s: float) -> Worn:
-    """Return the subject with a sensor that becomes silent."""
-    q = np.where(person.t_s[:, None] < at_s, person.said[name], np.nan)
-    return person.spoilt(name, q)
+def silent(person: SubjectRecording, name: str, at_s: float) -> SubjectRecording:
+    """Return a copy in which a sensor sends nothing from `at_s` on."""
+    q = np.where(person.t_s[:, None] < at_s, person.orientations[name], np.nan)
+    return person.with_orientations(name, q)
 
 
-def slipped(person: Worn, name: str, at_s: float, angle_rad: float, seed: int) -> Worn:
-    """Return the subject with a sensor that slips in a random direction within 0.3 s."""
+def slipped(
+    person: SubjectRecording, name: str, at_s: float, angle_rad: float, seed: int
+) -> SubjectRecording:
+    """Return a copy in which a sensor slips in a random direction within 0.3 s."""
     axis = np.random.default_rng(seed).normal(size=3)
     axis /= np.linalg.norm(axis)
     share = np.clip((person.t_s - at_s) / 0.3, 0.0, 1.0)
     slide = Rotation.from_rotvec(angle_rad * share[:, None] * axis)
-    return person.spoilt(name, to_wxyz(from_wxyz(person.said[name]) * slide))
+    return person.with_orientations(name, to_wxyz(from_wxyz(person.orientations[name]) * slide))
 
 
-def drifting(person: Worn, names: Sequence[str], rate_rad_s: float) -> Worn:
-    """Return the subject with sensors whose worlds rotate about the vertical."""
+def drifting(person: SubjectRecording, names: Sequence[str], rate_rad_s: float) -> SubjectRecording:
+    """Return a copy in which the worlds of some sensors rotate about the vertical."""
     for name in names:
         turn = rotation.heading(rate_rad_s * person.t_s)
-        person = person.spoilt(name, rotation.multiply(turn, person.said[name]))
+        person = person.with_orientations(name, rotation.multiply(turn, person.orientations[name]))
     return person
 
 
-def pulled(person: Worn, names: Sequence[str], at_s: float, angle_rad: float) -> Worn:
-    """Return the subject with a magnetic disturbance: headings deviate for 30 s and return.
+def pulled(
+    person: SubjectRecording, names: Sequence[str], at_s: float, angle_rad: float
+) -> SubjectRecording:
+    """Return a copy with a magnetic disturbance: headings deviate for 30 s and return.
 
     The deviation rises and falls within :data:`PULL_S`, as in a filter with a time constant of
     seconds.
@@ -125,7 +129,7 @@ def pulled(person: Worn, names: Sequence[str], at_s: float, angle_rad: float) ->
     begin, end = (person.t_s - at_s) / PULL_S, (person.t_s - at_s - PULL_S - STAY_S) / PULL_S
     turn = rotation.heading(angle_rad * (_smooth(begin) - _smooth(end)))
     for name in names:
-        person = person.spoilt(name, rotation.multiply(turn, person.said[name]))
+        person = person.with_orientations(name, rotation.multiply(turn, person.orientations[name]))
     return person
 
 
@@ -136,33 +140,40 @@ def _smooth(share: Array) -> Array:
 
 
 def play(
-    fuser: LimbFuser, person: Worn
+    fuser: LimbFuser, person: SubjectRecording
 ) -> tuple[list[LimbState], list[tuple[float, SensorReport]]]:
     """Return the fused result of every frame, and the events with their times (s)."""
-    rows = {name: [(w, x, y, z) for w, x, y, z in q.tolist()] for name, q in person.said.items()}
-    states, told = [], []
+    rows = {
+        name: [(w, x, y, z) for w, x, y, z in q.tolist()] for name, q in person.orientations.items()
+    }
+    states, reports = [], []
     for k, t_s in enumerate(person.t_s.tolist()):
         t_ns = round((BEGIN_S + t_s) * NS)
-        heard = {name: q[k] for name, q in rows.items() if q[k][0] == q[k][0]}  # NaN is no sample
-        states.append(fuser.fuse(t_ns, t_ns, k, heard))
-        told += [(t_s, news) for news in fuser.pop_reports(t_ns)]
-    return states, told
+        samples = {name: q[k] for name, q in rows.items() if q[k][0] == q[k][0]}  # NaN is no sample
+        states.append(fuser.fuse(t_ns, t_ns, k, samples))
+        reports += [(t_s, report) for report in fuser.pop_reports(t_ns)]
+    return states, reports
 
 
-def oriented(states: Sequence[LimbState], segment: int) -> Array:
+def segment_orientations(states: Sequence[LimbState], segment: int) -> Array:
     """Return the orientations q_world_segment, shape (n, 4)."""
     return np.array([state.segments[segment].q_world_segment for state in states])
 
 
 def jumps(before: Sequence[LimbState], after: Sequence[LimbState], segment: int) -> Array:
     """Return the change of the output that a fault causes, in predicted RMS errors, shape (n,)."""
-    claimed = np.array([state.segments[segment].sd for state in after], dtype=np.float64)
-    moved = rotation.angle_between(oriented(before, segment), oriented(after, segment))
-    return np.asarray(moved / (np.sqrt(3.0) * claimed))
+    predicted = np.array([state.segments[segment].sd for state in after], dtype=np.float64)
+    moved = rotation.angle_between(
+        segment_orientations(before, segment), segment_orientations(after, segment)
+    )
+    return np.asarray(moved / (np.sqrt(3.0) * predicted))
 
 
-def joint_errors(states: Sequence[LimbState], person: Worn) -> Array:
+def joint_errors(states: Sequence[LimbState], person: SubjectRecording) -> Array:
     """Return the angle between the estimated and the true knee rotation, rad, shape (n,)."""
-    above, below = (rotation.conjugate(oriented(states, 0)), oriented(states, 1))
+    above, below = (
+        rotation.conjugate(segment_orientations(states, 0)),
+        segment_orientations(states, 1),
+    )
     true = rotation.multiply(rotation.conjugate(person.bones["thigh"]), person.bones["shank"])
     return rotation.angle_between(rotation.multiply(above, below), true)

@@ -48,7 +48,7 @@ def run() -> DriftRun:
     rate = float(np.deg2rad(DRIFT_DEG_PER_MIN)) / 60.0
     turn = rotation.heading(rate * np.maximum(person.t_s - DRIFT_FROM_S, 0.0))
     for name in DRIFTING:
-        person = person.spoilt(name, rotation.multiply(turn, person.said[name]))
+        person = person.with_orientations(name, rotation.multiply(turn, person.orientations[name]))
 
     errors: dict[bool, Array] = {}
     reports: list[tuple[float, SensorReport]] = []

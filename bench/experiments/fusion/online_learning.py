@@ -16,7 +16,7 @@ import numpy as np
 
 from bench.framework.experiment import Experiment, Result
 from bench.framework.material import SIMULATED_SUBJECTS
-from bench.subjects.faulty_wearer import Worn, play
+from bench.subjects.faulty_wearer import SubjectRecording, play
 from bench.subjects.simulated_wearer import NS, bench_rig
 from jointfit_daemon.calibration import (
     CalibrationError,
@@ -179,7 +179,7 @@ def taught(seed: int, calibration: Calibration) -> tuple[Calibration, int]:
 def squares(one: Person, calibration: Calibration, span: tuple[float, float]) -> Array:
     """Return the mean squared errors of flexion, thigh and shank in a period, rad²."""
     now = (one.t_s >= span[0]) & (one.t_s < span[1])
-    part = Worn(
+    part = SubjectRecording(
         one.t_s[now] - one.t_s[now][0],
         {name: q[now] for name, q in one.said.items()},
         {name: q[now] for name, q in one.bones.items()},

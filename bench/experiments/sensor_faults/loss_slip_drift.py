@@ -72,13 +72,15 @@ def fuser_of(calibration: Calibration) -> LimbFuser:
 
 def _cases(
     seeds: tuple[int, ...],
-    spoil: Callable[[faulty_wearer.Worn, str, float, int], faulty_wearer.Worn],
+    spoil: Callable[
+        [faulty_wearer.SubjectRecording, str, float, int], faulty_wearer.SubjectRecording
+    ],
 ) -> Iterator[tuple[float, str, list[tuple[float, SensorReport]], Array]]:
     """Yield for every subject and sensor: start of the fault, sensor, events, and jumps."""
     for seed, calibration in calibrated_people(seeds):
         person = faulty_wearer.live(seed, FAULT_S, RATE_HZ)
         before, _ = faulty_wearer.play(fuser_of(calibration), person)
-        for k, name in enumerate(person.said):
+        for k, name in enumerate(person.orientations):
             at_s = FIRST_S + APART_S * k + 0.37 * seed
             after, told = faulty_wearer.play(
                 fuser_of(calibration), spoil(person, name, at_s, 10 * seed + k)
@@ -89,7 +91,9 @@ def _cases(
 
 
 def _found(
-    spoil: Callable[[faulty_wearer.Worn, str, float, int], faulty_wearer.Worn],
+    spoil: Callable[
+        [faulty_wearer.SubjectRecording, str, float, int], faulty_wearer.SubjectRecording
+    ],
     state: str,
     goal_s: float,
     seeds: tuple[int, ...],
@@ -150,8 +154,8 @@ def false_alarms(
             begin_s = faulty_wearer.BEGIN_S + part_s * part
             person = faulty_wearer.live(seed, part_s, DRIFT_HZ, begin_s)
             faulty_wearer.live.cache_clear()
-            moved = faulty_wearer.Worn(
-                person.t_s + part_s * part, person.said, person.bones, person.flexion
+            moved = faulty_wearer.SubjectRecording(
+                person.t_s + part_s * part, person.orientations, person.bones, person.flexion
             )
             told += len(faulty_wearer.play(fuser, moved)[1])
             played += part_s / 3600
@@ -175,7 +179,9 @@ def real_skin(data: Path, trained: str, deals: Sequence[int] = DEALS) -> list[Re
         for movement in MOVEMENTS:
             if movement != trained:
                 trial = _offline(recorded_leg(data, movement, case), movement)
-                person = faulty_wearer.Worn(trial.t_s, trial.sensors, trial.reference, trial.t_s)
+                person = faulty_wearer.SubjectRecording(
+                    trial.t_s, trial.sensors, trial.reference, trial.t_s
+                )
                 told = faulty_wearer.play(LimbFuser(KNEE, calibration), person)[1]
                 alarms.append(bool(told))
                 seconds += float(trial.t_s[-1])

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from bench.subjects.faulty_wearer import Worn
+    from bench.subjects.faulty_wearer import SubjectRecording
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import LimbState
@@ -73,7 +73,7 @@ class Pulled(NamedTuple):
 
 def _cases(
     seeds: tuple[int, ...], groups: Sequence[tuple[str, ...]]
-) -> Iterator[tuple[Calibration, Worn, tuple[str, ...], float, float]]:
+) -> Iterator[tuple[Calibration, SubjectRecording, tuple[str, ...], float, float]]:
     for seed, calibration in calibrated_people(seeds):
         person = faulty_wearer.live(seed, MAGNET_S, RATE_HZ)
         for k, names in enumerate(groups):
@@ -83,7 +83,11 @@ def _cases(
 
 
 def _pulled(
-    calibration: Calibration, person: Worn, names: tuple[str, ...], at_s: float, angle: float
+    calibration: Calibration,
+    person: SubjectRecording,
+    names: tuple[str, ...],
+    at_s: float,
+    angle: float,
 ) -> Pulled:
     healthy, _ = faulty_wearer.play(fuser_of(calibration), person)
     states, told = faulty_wearer.play(
@@ -117,13 +121,15 @@ def _share_passed(angle: float) -> float:
     return float(np.interp(np.deg2rad(PASSED_DEG), way, grid))
 
 
-def _over_claimed(states: Sequence[LimbState], person: Worn, i: int) -> Array:
+def _over_claimed(states: Sequence[LimbState], person: SubjectRecording, i: int) -> Array:
     claimed = np.sqrt(3.0) * np.array([s.segments[i].sd for s in states], dtype=np.float64)
     true = person.bones[SEGMENTS[i]]
-    return np.asarray(rotation.angle_between(faulty_wearer.oriented(states, i), true) / claimed)
+    return np.asarray(
+        rotation.angle_between(faulty_wearer.segment_orientations(states, i), true) / claimed
+    )
 
 
-def _flexion_over_claimed(states: Sequence[LimbState], person: Worn) -> Array:
+def _flexion_over_claimed(states: Sequence[LimbState], person: SubjectRecording) -> Array:
     knees = [state.joints[1] for state in states]
     said = np.array([np.nan if k.angles is None else k.angles.flexion for k in knees])
     sd = np.array([np.nan if k.angle_sd is None else k.angle_sd for k in knees])
