@@ -8,8 +8,9 @@ contains the number of tests in both parts, and the time in seconds.
 
 System tests start daemons in real time, and tests with the marker `real_time` simulate devices that
 send in real time. Other tests on the same cores can delay both. If such a test fails while others
-run, it is repeated once, alone. It passes only if it then passes, and the summary names it. Other
-tests are not repeated.
+run, it is repeated once, alone. It passes only if it then passes, and the summary names it.
+Experiments are repeated in the same way, because those that compute run at low priority and can
+exceed a time limit; a wrong result is computed again. Other tests are not repeated.
 
 Invariant: the exit status is 0 only if both parts passed.
 """
@@ -60,7 +61,7 @@ def main(arguments: list[str]) -> int:
     parallel = _run(parts[0], reports, [*WORKERS, str(workers), *arguments])
     disturbed: list[str] = []
     if parallel == TESTS_FAILED:
-        disturbed = _repeat_tests_in_real_time(parts[0], reports)
+        disturbed = _repeat_disturbed_tests(parts[0], reports, experiments)
         parallel = 0 if disturbed else parallel
     alone = _run(parts[1], reports, arguments or _files_of_tests_alone())
 
@@ -88,8 +89,8 @@ def _files_of_tests_alone() -> list[str]:
     return [str(path) for path in files if "mark.alone" in path.read_text(encoding="utf-8")]
 
 
-def _repeat_tests_in_real_time(part: str, reports: Path) -> list[str]:
-    """Repeat failed tests in real time alone; return their names if this cleared all failures.
+def _repeat_disturbed_tests(part: str, reports: Path, experiments: bool) -> list[str]:
+    """Repeat failed tests that others can delay; return their names if this cleared all failures.
 
     The tests are selected by name: `--last-failed` does not select tests whose subtests failed.
     """
@@ -98,7 +99,9 @@ def _repeat_tests_in_real_time(part: str, reports: Path) -> list[str]:
         for name, case in _cases(reports / f"{part}.xml")
         if {"failure", "error"} & {child.tag for child in case}
     }
-    selection = [*map(_node_id, sorted(failed)), "-m", "system or real_time"]
+    selection = [*map(_node_id, sorted(failed))]
+    if not experiments:
+        selection += ["-m", "system or real_time"]
     if not failed or _run(part, reports, selection, report="repeated") != 0:
         return []
     repeated = {name for name, _ in _cases(reports / "repeated.xml")}

@@ -4,25 +4,64 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from tests.conftest import EXPERIMENT_TIMEOUT_S
 
+if TYPE_CHECKING:
+    from types import ModuleType
+
 ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture
+def suite(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(ROOT / ".ci"))
+    module = __import__("suite")
+    sys.modules.pop("suite")
+    return module
 
 
 class TestNames:
     @pytest.mark.parametrize("word", ["plain", "a b.c::d"])
     def test_the_name_in_a_report_selects_the_same_test(
-        self, word: str, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+        self, word: str, request: pytest.FixtureRequest, suite: ModuleType
     ) -> None:
-        monkeypatch.syspath_prepend(str(ROOT / ".ci"))
-        suite = __import__("suite")
-        sys.modules.pop("suite")
         name = f"tests.test_suite.TestNames::{request.node.name}"
         assert word in name
         assert suite._node_id(name) == f"{ROOT}/{request.node.nodeid}"
+
+
+REPORT = """<testsuites><testsuite>
+<testcase classname="tests.test_suite" name="test_one"><failure/></testcase>
+<testcase classname="tests.test_suite" name="test_two"/>
+</testsuite></testsuites>"""
+
+
+@pytest.mark.parametrize("experiments", [True, False])
+@pytest.mark.parametrize("status", [0, 1])
+def test_a_failed_experiment_counts_as_passed_only_if_it_passes_alone(
+    tmp_path: Path,
+    suite: ModuleType,
+    monkeypatch: pytest.MonkeyPatch,
+    experiments: bool,
+    status: int,
+) -> None:
+    (tmp_path / "part.xml").write_text(REPORT, encoding="utf-8")
+    calls: list[list[str]] = []
+
+    def run(_part: str, reports: Path, arguments: list[str], report: str) -> int:
+        calls.append(arguments)
+        (reports / f"{report}.xml").write_text(REPORT, encoding="utf-8")
+        return status
+
+    monkeypatch.setattr(suite, "_run", run)
+    cleared = suite._repeat_disturbed_tests("part", tmp_path, experiments)
+    assert cleared == ([] if status else ["tests.test_suite::test_one"])
+    only_real_time = [] if experiments else ["-m", "system or real_time"]
+    assert calls == [[f"{ROOT}/tests/test_suite.py::test_one", *only_real_time]]
 
 
 @pytest.mark.experiment

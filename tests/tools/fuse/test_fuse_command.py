@@ -265,7 +265,7 @@ def test_a_plot_is_written(files: Path) -> None:
     subprocess.run(  # in a new process, because matplotlib keeps its fonts open
         [sys.executable, "-m", "jointfit_daemon.tools", *map(str, arguments)],
         check=True,
-        timeout=25,
+        timeout=80,
     )
     assert (files / "plot.png").read_bytes().startswith(b"\x89PNG")
 
