@@ -35,7 +35,7 @@ def main() -> int:
         print(f"not audited: {reason[0]}")
         return 0
     known = [
-        f"{item['name']} {item['version']}: {hole['id']}, mended in "
+        f"{item['name']} {item['version']}: {hole['id']}, fixed in "
         f"{', '.join(hole['fix_versions']) or 'no release yet'}"
         for item in found
         for hole in item.get("vulns", [])

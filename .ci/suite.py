@@ -67,7 +67,7 @@ def main(arguments: list[str]) -> int:
 
     duration_s = time.monotonic() - began
     for test in disturbed:
-        print(f"failed beside others, passed alone: {test}")
+        print(f"failed next to others, passed alone: {test}")
     print(
         f"{name}: {_counts(reports, disturbed)} in {duration_s:.0f} s on {cores} cores", flush=True
     )

@@ -121,7 +121,7 @@ def clocks(trace: Trace, about: SimulatedRun) -> Figure:
     offset.axhline(0.0, color="0.8", lw=0.8, zorder=0)
     gaps.set_yticks(range(len(colors)), colors)
     gaps.set_ylim(-0.6, len(colors) - 0.4)
-    gaps.set_xlabel("time, s      (a mark is a sample that never came; its length says how many)")
+    gaps.set_xlabel("time, s      (a mark is a run of missing samples; its length is their number)")
     _legend(figure, colors, offset)
     return figure
 
@@ -198,7 +198,7 @@ def alignment(trace: Trace, about: SimulatedRun) -> Figure:
     """Error of the stamps if the truth is known, and waiting time of the frames."""
     errors = true_errors(trace, about.taken_ns, about.unseen_ns) if about.taken_ns else {}
     panels = [f"{name}: error, ms" for name in sorted(errors)]
-    note = " (error less the smallest delay, which only the lag tells)" if errors else ""
+    note = " (error less the smallest delay, which only the lag shows)" if errors else ""
     figure = _figure(
         f"Alignment{note}",
         [*panels, "frame latency, ms"],

@@ -54,14 +54,14 @@ def _title(found: EstimatedCenters) -> str:
     lines = [found.joint.name]
     for method in METHODS:
         e = found.estimates[method]
-        told = "refused" if e.refused else f"told ±{_MM * e.sd:.0f}"
-        told = "place along the axis unknown" if len(e.unseen) else told
+        claimed = "refused" if e.refused else f"claimed ±{_MM * e.sd:.0f}"
+        claimed = "place along the axis unknown" if len(e.unseen) else claimed
         if not np.isfinite(e.center).all():
             lines.append(f"{method}: refused")
             continue
         lines.append(
             f"{method}: {_MM * found.off(method):.0f} mm from the model,"
-            f" {_MM * found.off_axis(method):.0f} across;\n{told}"
+            f" {_MM * found.off_axis(method):.0f} across;\n{claimed}"
         )
     return "\n".join(lines)
 

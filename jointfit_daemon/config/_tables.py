@@ -433,8 +433,8 @@ class MetricsSettings(Settings):
 
     listen: str = Field(
         "127.0.0.1:9464",
-        description="address and port of http://HOST:PORT/metrics; whoever reaches it can read "
-        "the metrics",
+        description="address and port of http://HOST:PORT/metrics; every host that reaches it "
+        "can read the metrics",
     )
 
     @field_validator("listen")

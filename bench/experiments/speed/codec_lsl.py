@@ -113,7 +113,7 @@ def rows(quick: bool) -> list[Result]:
 
 EXPERIMENTS = (
     replace(
-        speed_experiment("lsl-codec", "LSL markers: codec and decoder, beside pylsl", rows),
+        speed_experiment("lsl-codec", "LSL markers: codec and decoder, compared with pylsl", rows),
         packages=("pylsl",),
     ),
 )

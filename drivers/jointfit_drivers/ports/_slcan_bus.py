@@ -140,7 +140,7 @@ class SlcanBus:
         if await self._ask(b"S%d\r" % BITRATES.index(settings.bitrate)) == "\a":
             raise DeviceMisconfiguredError(
                 f"{settings.channel}: the adapter refuses {settings.bitrate} bit/s: "
-                "set `bitrate` of the [can] table to what adapter and sensors share"
+                "set `bitrate` of the [can] table to the bit rate of adapter and sensors"
             )
 
         answer = await self._ask(b"O\r")

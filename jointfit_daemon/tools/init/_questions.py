@@ -335,7 +335,7 @@ QUESTIONS: tuple[Question, ...] = (
         "Markers on the {subject}",
         "Names in the stream, separated by commas: at least three that are not on one line."
         " 'find' reads the names from the stream. 'later' leaves the place open until they are"
-        " known. Body parts beside the segments may have none.",
+        " known. Body parts that are not segments may have none.",
         postponable=True,
         subjects=lambda answers, _: marked_parts(answers),
         default=_proposals.markers,

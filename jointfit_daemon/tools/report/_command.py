@@ -18,7 +18,7 @@ def report(
     ],
     *,
     out: Annotated[
-        Path | None, typer.Option("--out", help="Page to write; default: beside the recording.")
+        Path | None, typer.Option("--out", help="Page to write; default: next to the recording.")
     ] = None,
     json: Annotated[
         bool, typer.Option("--json", help="Print the name of the page as JSON.")

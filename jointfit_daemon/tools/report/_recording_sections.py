@@ -45,7 +45,7 @@ def sources_section(results: SessionResults) -> str:
     """Return the timeline and the table of sensors and cameras."""
     if not results.sources:
         text = "The file contains no samples of sensors or cameras, only results."
-        return section("recorded", "What was recorded", [paragraph(text)])
+        return section("recorded", "Recorded data", [paragraph(text)])
 
     segments = {sensor.id: sensor.segment for sensor in results.session.sensors}
     marker_count = len(results.session.markers.labels) if results.session.markers else 0
@@ -70,7 +70,7 @@ def sources_section(results: SessionResults) -> str:
     text = "Lost: share of the expected samples between the first and the last one that is missing."
     return section(
         "recorded",
-        "What was recorded",
+        "Recorded data",
         [
             figure(drawing, "Data of every source over time; vertical lines are marks.", legend),
             table("Sensors and cameras", head, rows, text=2),

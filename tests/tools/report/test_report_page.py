@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 STEPS = (Step("stand", 5.0), Step("walk", 25.0), Step("squat", 10.0))
 SECTIONS = (
     "Joint angles", "Gait cycles", "Range of motion", "Sensors against cameras",
-    "What was recorded", "Timing", "Calibration", "Faults and events",
+    "Recorded data", "Timing", "Calibration", "Faults and events",
 )  # fmt: skip
 VOID = {"meta", "line", "path", "rect", "br"}
 

@@ -39,7 +39,7 @@ const ACTIONS = {
   }),
   stopRecording: () => ({
     menu: "", title: "Stop the recording", done: "Recording stopped", button: "Stop recording", command: "record",
-    text: "jointfitd completes the file. What the sensors send afterwards is not recorded.",
+    text: "jointfitd completes the file. Later data of the sensors are not recorded.",
     content: () => ({ action: "stop" }),
     answer: recordedContent,
   }),
