@@ -77,6 +77,17 @@ HALVES = {
     "world": "NWU",
     "direction": "world_to_sensor",
 }
+PAGES = HALVES | {
+    "ids": {"first": 0x200, "second": 0x200},
+    "starts_with": {"first": "55 01", "second": "55 02"},
+    "extended_ids": False,
+    "fields": {
+        "quaternion": [
+            {"frame": "first", "offset": 2, "type": "i24", "divisor": 8388607, "order": "wx"},
+            {"frame": "second", "offset": 2, "type": "i24", "divisor": 8388607, "order": "yz"},
+        ]
+    },
+}
 ONE_FRAME = {
     "ids": {"quaternion": 0x181},
     "byte_order": "big",

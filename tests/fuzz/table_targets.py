@@ -20,6 +20,7 @@ from tests.drivers.self_described import (
     HALVES,
     INTEGERS,
     LINES,
+    PAGES,
     SBG,
     can_settings,
     serial_settings,
@@ -47,7 +48,7 @@ def serial_tables() -> list[tuple[SerialTableSettings, Driver]]:
 @cache
 def can_tables() -> list[tuple[CanTableSettings, Driver]]:
     """Return settings and driver of each CAN table."""
-    found = [can_settings("virtual", "fuzz", table) for table in (SBG, HALVES)]
+    found = [can_settings("virtual", "fuzz", table) for table in (SBG, HALVES, PAGES)]
     return [(settings, find_driver("can-table")(settings)) for settings in found]
 
 

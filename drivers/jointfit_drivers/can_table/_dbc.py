@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jointfit_daemon.name_lists import list_names
 from jointfit_drivers.table_samples import FieldFaultError
-from jointfit_protocols.table import Kind, TableField
+from jointfit_protocols.table import FieldReader, Kind, Multiplexer, TableField
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -40,6 +40,9 @@ class DbcSignal(NamedTuple):
     """Position in the frame, with scale and offset as in the file."""
     unit: str | None
     """Unit of the signal; None if rig.toml has no such unit."""
+    multiplexer: Multiplexer | None
+    """Values of the multiplexer with which the frame contains the signal; None if every frame
+    does."""
 
 
 def read_signals(path: str, names: Sequence[str]) -> list[DbcSignal]:
@@ -49,7 +52,7 @@ def read_signals(path: str, names: Sequence[str]) -> list[DbcSignal]:
     ------
     FieldFaultError
         The package or the file is missing, the file is malformed, or its signals overlap. Or a
-        signal is missing, ambiguous or multiplexed.
+        signal is missing or ambiguous.
     """
     if find_spec("cantools") is None:
         raise FieldFaultError("signals", PACKAGE_MISSING)
@@ -96,14 +99,17 @@ def _signal(name: str, messages: Sequence[Any], file: str) -> DbcSignal:
         raise FieldFaultError("signals", text)
 
     message, signal = found[0]
-    if signal.is_multiplexer or signal.multiplexer_ids is not None:
-        text = f"{name!r} is multiplexed in {message.name}: such signals cannot be used"
-        raise FieldFaultError("signals", text)
+    unit = _UNITS.get((signal.unit or "").strip())
+    key = (message.frame_id, bool(message.is_extended_frame))
+    return DbcSignal(key, _place(signal), unit, _multiplexer(message, signal))
+
+
+def _place(signal: Any) -> TableField:
     kind: Kind = "f" if signal.is_float else "i" if signal.is_signed else "u"
     little = signal.byte_order == "little_endian"
     # A big-endian signal starts at its most significant bit.
     bit = signal.start % 8 if little else 7 - signal.start % 8
-    place = TableField(
+    return TableField(
         signal.start // 8,
         kind,
         signal.length,
@@ -112,5 +118,28 @@ def _signal(name: str, messages: Sequence[Any], file: str) -> DbcSignal:
         float(signal.scale),
         float(signal.offset),
     )
-    unit = _UNITS.get((signal.unit or "").strip())
-    return DbcSignal((message.frame_id, bool(message.is_extended_frame)), place, unit)
+
+
+def _multiplexer(message: Any, signal: Any) -> Multiplexer | None:
+    """Return the values of the multiplexer with which a frame contains a signal.
+
+    A multiplexer may itself be multiplexed (extended multiplexing). All of them are then one
+    multiplexer with the bits of all.
+    """
+    if signal.multiplexer_ids is None:
+        return None
+    selecting = message.get_signal_by_name(signal.multiplexer_signal)
+    place = _place(selecting)._replace(kind="u")
+    reader = FieldReader([place])
+
+    def at_its_bits(value: int) -> int:
+        data = bytearray(reader.size)
+        reader.write(data, [value])
+        return int.from_bytes(data, "little")
+
+    mask = at_its_bits(place.modulus - 1)
+    values = {at_its_bits(value) for value in signal.multiplexer_ids}
+    if outer := _multiplexer(message, selecting):
+        mask |= outer.mask
+        values = {value | other for value in values for other in outer.values}
+    return Multiplexer(mask, frozenset(values))

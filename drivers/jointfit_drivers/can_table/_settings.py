@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field, field_validator
@@ -25,14 +26,16 @@ from jointfit_drivers.table_samples import (
     sample_form,
 )
 from jointfit_protocols.can import EXTENDED_MAX, STANDARD_MAX
-from jointfit_protocols.table import MEASURED, CanTable
+from jointfit_protocols.table import MEASURED, CanTable, Multiplexer
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from jointfit_drivers.ports.can_bus import CanKey
     from jointfit_protocols.table import Quantity, TableField
 
 _FRAME_BYTES = 8
+_HEX_BYTES = r"^\s*([0-9A-Fa-f]{2}\s*){1,8}$"
 _SHARE_OF_PERIOD = 0.5
 """Longest time between the first and the last frame of a sample, in nominal periods."""
 
@@ -77,10 +80,16 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
     extended_ids: bool = Field(
         False, description="29-bit identifiers even where the numbers would fit 11 bits"
     )
+    starts_with: dict[str, Annotated[str, Field(pattern=_HEX_BYTES)]] = Field(
+        {},
+        description="first data bytes, hexadecimal, of frames with the same identifier, by the "
+        "names of `ids`; frames that begin with other bytes are ignored",
+        examples=[{"rate": "01", "acceleration": "02"}],
+    )
     sequence: tuple[str, ...] = Field(
         (),
         description="names of `ids` in the order in which the device sends the frames of a sample; "
-        "default: the lowest identifier first",
+        "default: the lowest identifier first; frames with the same identifier as in `ids`",
     )
     dbc: str | None = Field(None, description="DBC file with the `signals` of the fields")
     fields: CanFields = Field(description="place, scale and unit of each quantity")
@@ -113,6 +122,8 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
             return
         form = self.places()
         yield from form.faults
+        yield from self._multiplexers()[1]
+        yield from self._shared_id_faults()
         sizes = dict.fromkeys(range(len(self.ids)), _FRAME_BYTES)
         yield from overlap_faults(form, {}, sizes)
         if form.faults:
@@ -153,7 +164,13 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
     def can_table(self) -> CanTable:
         """Return the layout of the frames for the codec."""
         longest_ns = round(_SHARE_OF_PERIOD * 1e9 / self.rate_hz)
-        return CanTable(self.keys(), self.places().fields, longest_ns, self.order())
+        return CanTable(
+            self.keys(), self.places().fields, longest_ns, self.order(), self.multiplexers()
+        )
+
+    def multiplexers(self) -> dict[int, Multiplexer]:
+        """Return the multiplexers of the frames that have one, by their places in `order`."""
+        return self._multiplexers()[0]
 
     def _place(self, name: Quantity, part: FieldSettings, count: int) -> list[TableField]:
         """Return the positions of a field, from its offset or from the DBC file."""
@@ -169,21 +186,76 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
         if len(signals) != count:
             text = f"{len(signals)} signals for {count} components: expected one of each"
             raise FieldFaultError("signals", text)
-        keys = self.keys()
         placed = []
         for found in read_signals(self.dbc, signals):
-            if found.key not in keys:
-                number = f"{found.key[0]:#x}" + (" (29 bits)" if found.key[1] else "")
-                text = f"are in the frame {number}, which is not in `ids`: add it"
-                raise FieldFaultError("signals", text)
             si = 1.0 if part.unit else UNITS.get(name, {}).get(found.unit or "", 1.0)
             place = found.place
             placed.append(
                 place._replace(
-                    frame=keys.index(found.key), scale=place.scale * si, zero=place.zero * si
+                    frame=self._frame_of_signal(found.key, name, part),
+                    scale=place.scale * si,
+                    zero=place.zero * si,
                 )
             )
         return placed
+
+    def _frame_of_signal(self, key: CanKey, name: str, part: FieldSettings) -> int:
+        """Return the number of the frame that contains a signal of the DBC file."""
+        order = self.order()
+        possible = [number for number, each in enumerate(self.keys()) if each == key]
+        if len(possible) == 1:
+            return possible[0]
+        number = f"{key[0]:#x}" + (" (29 bits)" if key[1] else "")
+        if not possible:
+            text = f"are in the frame {number}, which is not in `ids`: add it"
+            raise FieldFaultError("signals", text)
+        chosen = getattr(part, "frame", None) or name
+        if chosen not in order or order.index(chosen) not in possible:
+            choices = ", ".join(order[each] for each in possible)
+            text = f"expected one of {choices}, which have the identifier {number}"
+            raise FieldFaultError("frame", text)
+        return order.index(chosen)
+
+    def _multiplexers(self) -> tuple[dict[int, Multiplexer], list[tuple[str, str]]]:
+        """Return the multiplexers of `starts_with` and of the DBC file, and their faults."""
+        order = self.order()
+        found: dict[int, Multiplexer] = {}
+        faults = []
+        for name, digits in self.starts_with.items():
+            if name not in order:
+                faults.append(
+                    (f"starts_with.{name}", f"expected a name of `ids`: {', '.join(order)}")
+                )
+                continue
+            first = bytes.fromhex(digits)
+            mask = int.from_bytes(b"\xff" * len(first), "little")
+            value = int.from_bytes(first, "little")
+            found[order.index(name)] = Multiplexer(mask, frozenset({value}))
+
+        for quantity, number, multiplexer in self._multiplexed_signals():
+            before = found.setdefault(number, multiplexer)
+            common = before.values & multiplexer.values
+            if before.mask != multiplexer.mask or not common:
+                text = (
+                    f"is not in the same frames as the rest of {order[number]!r}, because it is "
+                    "multiplexed: give each value of the multiplexer a frame of its own in `ids`"
+                )
+                faults.append((f"fields.{quantity}", text))
+            else:
+                found[number] = Multiplexer(before.mask, common)
+        return found, faults
+
+    def _multiplexed_signals(self) -> Iterator[tuple[str, int, Multiplexer]]:
+        """Yield quantity, frame and multiplexer of each multiplexed signal of the DBC file."""
+        for quantity, parts in self.fields:
+            for part in parts:
+                if self.dbc is None or part.signals is None:
+                    continue
+                with suppress(FieldFaultError):  # `places` reports it
+                    for signal in read_signals(self.dbc, part.signals):
+                        if signal.multiplexer is not None:
+                            number = self._frame_of_signal(signal.key, quantity, part)
+                            yield quantity, number, signal.multiplexer
 
     def _frame(self, name: Quantity, part: FieldSettings) -> int:
         """Return the number of the frame that contains a field."""
@@ -202,10 +274,7 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
         return order.index(frame)
 
     def _id_faults(self) -> Iterator[tuple[str, str]]:
-        owners: dict[int, str] = {}
         for name, number in self.ids.items():
-            if (owner := owners.setdefault(number, name)) != name:
-                yield f"ids.{name}", f"0x{number:X} is that of {owner} already: give each its own"
             if number > STANDARD_MAX and self.extended_ids is False:
                 yield (
                     "extended_ids",
@@ -216,10 +285,31 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
         if self.sequence and sorted(self.sequence) != sorted(self.ids):
             yield "sequence", f"expected each name of `ids` once: {', '.join(self.ids)}"
 
+    def _shared_id_faults(self) -> Iterator[tuple[str, str]]:
+        """Yield the frames whose data do not distinguish them from another frame."""
+        order, multiplexers = self.order(), self.multiplexers()
+        for at, name in enumerate(order):
+            for before, owner in enumerate(order[:at]):
+                if self.ids[owner] != self.ids[name]:
+                    continue
+                one, other = multiplexers.get(before), multiplexers.get(at)
+                if one is None or other is None or not one.excludes(other):
+                    text = (
+                        f"0x{self.ids[name]:X} is that of {owner} already: give each its own, or "
+                        "the data bytes with which each begins in `starts_with`"
+                    )
+                    yield f"ids.{name}", text
+
     def _is_readable(self) -> bool:
         """Return whether the keys that define field positions are valid; faulty keys are None."""
         ids: Any = self.ids
-        keys: list[Any] = [self.extended_ids, self.sequence, self.byte_order, self.rate_hz]
+        keys: list[Any] = [
+            self.extended_ids,
+            self.starts_with,
+            self.sequence,
+            self.byte_order,
+            self.rate_hz,
+        ]
         fields: Any = self.fields
         if None in [ids, fields, *keys] or None in ids.values():
             return False

@@ -4,6 +4,7 @@ from jointfit_protocols.table._can_frames import (
     CanSample,
     CanTable,
     CanTableCodec,
+    Multiplexer,
     encode_can_frames,
 )
 from jointfit_protocols.table._checksums import WIDTHS, Checksum, ChecksumKind, compile_checksum
@@ -43,6 +44,7 @@ __all__ = [
     "Kind",
     "LineCodec",
     "LineFormat",
+    "Multiplexer",
     "Quantity",
     "TableField",
     "TableItem",

@@ -5,6 +5,9 @@ completes the sample. The next sample begins with a frame that repeats or preced
 or that arrives more than `longest_ns` after the first frame. Samples without all their measurements
 are incomplete, and are dropped. Time, counter and validity may be missing.
 
+Frames with the same identifier are multiplexed: some bits of the data, the multiplexer, say which
+frame it is. A frame with another multiplexer value is a frame of another device.
+
 Invariant: the codec converts frames to samples. It uses no bus and no clock.
 """
 
@@ -23,6 +26,34 @@ if TYPE_CHECKING:
 CanKey = tuple[int, bool]
 
 
+class Multiplexer(NamedTuple):
+    """Bits of the data that distinguish frames with the same identifier.
+
+    The data bytes are read as one little-endian integer, whatever the byte order of the fields.
+    """
+
+    mask: int
+    """Bits of the multiplexer."""
+    values: frozenset[int]
+    """Values of these bits in the frame, at their positions in the integer."""
+
+    @property
+    def size(self) -> int:
+        """Smallest number of data bytes that contain the multiplexer."""
+        return (self.mask.bit_length() + 7) // 8
+
+    def matches(self, data: bytes) -> bool:
+        """Return whether the data are those of the frame."""
+        return len(data) >= self.size and int.from_bytes(data, "little") & self.mask in self.values
+
+    def excludes(self, other: Multiplexer) -> bool:
+        """Return whether no data match both."""
+        shared = self.mask & other.mask
+        return {value & shared for value in self.values}.isdisjoint(
+            value & shared for value in other.values
+        )
+
+
 class CanTable(NamedTuple):
     """Layout of the frames of a device."""
 
@@ -34,6 +65,8 @@ class CanTable(NamedTuple):
     """Longest time between the first and the last frame of a sample, ns."""
     names: tuple[str, ...] = ()
     """Names of the frames, which are used in messages."""
+    multiplexers: Mapping[int, Multiplexer] = {}
+    """Multiplexers of the frames that have one. The keys are indices of `keys`."""
 
 
 class CanSample(NamedTuple):
@@ -61,7 +94,12 @@ class CanTableCodec:
         self.slots = tuple(sorted(table.fields))
         """Slots of a record, in the order of its numbers."""
         self._parts = [_FramePart(table, number) for number in range(len(table.keys))]
-        self._numbers = {key: number for number, key in enumerate(table.keys)}
+        self._numbers = {
+            key: number for number, key in enumerate(table.keys) if number not in table.multiplexers
+        }
+        self._multiplexed: dict[CanKey, list[tuple[Multiplexer, int]]] = {}
+        for number, multiplexer in table.multiplexers.items():
+            self._multiplexed.setdefault(table.keys[number], []).append((multiplexer, number))
         self._single = len(table.keys) == 1
         self._start_ns = 0
         self._next = 0  # number of the frame that continues the open sample
@@ -79,6 +117,8 @@ class CanTableCodec:
         """Return the sample that `frame` completes; None if it completes none."""
         t_ns, can_id, data, extended, error, remote = frame
         number = self._numbers.get((can_id, extended))
+        if number is None and self._multiplexed:
+            number = self._select((can_id, extended), data)
         if number is None or error or remote:
             self.foreign += 1
             return None
@@ -109,6 +149,13 @@ class CanTableCodec:
         if self._next:
             self.incomplete += 1
         self._begin()
+
+    def _select(self, key: CanKey, data: bytes) -> int | None:
+        """Return the number of the multiplexed frame that has these data."""
+        for multiplexer, number in self._multiplexed.get(key, ()):
+            if multiplexer.matches(data):
+                return number
+        return None
 
     def _finish(self) -> CanSample | None:
         sample = None
@@ -163,7 +210,11 @@ def encode_can_frames(
     for number, key in enumerate(table.keys):
         mine = [at for at, slot in enumerate(slots) if table.fields[slot].frame == number]
         reader = FieldReader([table.fields[slots[at]] for at in mine])
-        data = bytearray(reader.size if sizes is None else sizes[number])
+        multiplexer = table.multiplexers.get(number)
+        size = max(reader.size, multiplexer.size if multiplexer else 0)
+        data = bytearray(size if sizes is None else sizes[number])
+        if multiplexer:
+            data[:] = min(multiplexer.values).to_bytes(len(data), "little")
         reader.write(data, [values[at] for at in mine])
         frames.append((key, bytes(data)))
     return frames

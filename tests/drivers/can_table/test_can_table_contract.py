@@ -11,7 +11,7 @@ from jointfit_drivers.can_table import CanTableImu
 from jointfit_simulators.driver_contract import DriverContract
 from jointfit_simulators.wires import PythonCanWire, SlcanAdapter
 from tests.drivers.driver_run import TextDevice
-from tests.drivers.self_described import HALVES, ONE_FRAME, SBG, can_device, can_settings
+from tests.drivers.self_described import HALVES, ONE_FRAME, PAGES, SBG, can_device, can_settings
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -47,6 +47,10 @@ class TestHalvesOfFloatsWith29BitIds(TestTimeAndQuaternionOverSlcan):
     # A flipped bit of a digit on the adapter's line is another number, and one of float32 mantissa
     # bits changes the norm too little to be detected.
     test_line_noise_affects_only_damaged_samples = None  # type: ignore[assignment]
+
+
+class TestFramesWithTheSameId(TestTimeAndQuaternionOverSlcan):
+    table = PAGES
 
 
 class TestOneFrameOnABusWithoutDescriptor(DriverContract):

@@ -9,14 +9,18 @@ import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 
 from jointfit_daemon.config import ConfigError, load_rig, parse_rig
 from jointfit_daemon.driver import find_driver
 from jointfit_daemon.model import Chunk, ImuSample
 from jointfit_daemon.tools.decoder_settings import decoder_settings
+from jointfit_drivers.can_table import CanTableSettings
+from jointfit_drivers.can_table._dbc import read_signals
 from jointfit_protocols.can import CanFrame, pack_frames
 from jointfit_protocols.orientation import canonical
+from jointfit_protocols.table import CanSample, CanTableCodec, Multiplexer
 
 if TYPE_CHECKING:
     from jointfit_daemon.config import Rig
@@ -133,6 +137,22 @@ Q = {"offset": 2, "type": "i16", "divisor": 32767}
             "ids.quaternion: id 0x181 on this bus belongs to S2",
         ),
         (
+            on_can(
+                {"quaternion": Q | {"offset": 0}},
+                ids={"a": 0x200, "b": 0x200},
+                starts_with={"a": "01", "b": "01 02"},
+            ),
+            "ids.b: 0x200 is that of a already: give each its own, or the data bytes with which",
+        ),
+        (
+            on_can({"quaternion": Q | {"offset": 0}}, starts_with={"quat": "01"}),
+            "starts_with.quat: expected a name of `ids`: time, quaternion",
+        ),
+        (
+            on_can({"quaternion": Q | {"offset": 0}}, starts_with={"quaternion": "0x1"}),
+            "starts_with.quaternion",
+        ),
+        (
             on_can({"quaternion": Q | {"offset": 0}}, sequence=["quaternion"]),
             "sequence = ('quaternion',): expected each name of `ids` once: time, quaternion",
         ),
@@ -151,7 +171,7 @@ def test_a_wrong_table_is_reported_with_its_remedy(table: dict[str, Any], expect
         ({}, None),
         ({"signals": ["Q0", "Q1", "Q2", "Q3"]}, "name one of QUAT.Q0, OTHER.Q0"),
         ({"signals": ["QUAT.Q0", "Q1", "Q2", "Q9"]}, "has no signal 'Q9'; it has A, M, Q0"),
-        ({"signals": ["QUAT.Q0", "Q1", "Q2", "A"]}, "'A' is multiplexed in MUXED"),
+        ({"signals": ["QUAT.Q0", "Q1", "Q2", "A"]}, "the frame 0x132, which is not in `ids`"),
         ({"signals": ["OTHER.Q0", "Q1", "Q2", "Q3"]}, "the frame 0x133, which is not in `ids`"),
         ({"signals": ["QUAT.Q0", "Q1"]}, "2 signals for 4 components"),
         ({"signals": ["QUAT.Q0", "Q1", "Q1", "Q3"]}, "components overlap"),
@@ -261,6 +281,92 @@ def test_dbc_tables_decode_as_cantools_does(shared_data: Path) -> None:
     signals = database.decode_message(0x131, data)
     assert sample.q_native == tuple(signals[f"Q{at}"] for at in range(4))
     assert sample.ticks == database.decode_message(0x130, frames[0].data)["TIME_STAMP"]
+
+
+PAGES = """VERSION ""
+BU_: H
+BO_ 512 RAW: 8 H
+ SG_ PAGE M : {page} (1,0) [0|0] "" H
+ SG_ NUMBER : 4|4@1+ (1,0) [0|0] "" H
+ SG_ WX m1 : 23|16@0- (0.01,0) [0|0] "deg/s" H
+ SG_ WY m1 : 39|16@0- (0.01,0) [0|0] "deg/s" H
+ SG_ WZ m1 : 55|16@0- (0.01,0) [0|0] "deg/s" H
+ SG_ AX m2 : 16|16@1- (0.001,0) [0|0] "g" H
+ SG_ AY m2 : 32|16@1- (0.001,0) [0|0] "g" H
+ SG_ AZ m2 : 48|16@1- (0.001,0) [0|0] "g" H
+ SG_ TEMPERATURE m3M : 8|8@1- (1,0) [0|0] "" H
+ SG_ Q0 m7 : 16|16@1- (1,0) [0|0] "" H
+ SG_ Q1 m9 : 32|16@1- (1,0) [0|0] "" H
+"""
+PAGES += "".join(
+    f"SG_MUL_VAL_ 512 {signal} {multiplexer} {first}-{last};\n"
+    for first, last, multiplexer, signals in (
+        (1, 1, "PAGE", "WX WY WZ"),
+        (2, 2, "PAGE", "AX AY AZ"),
+        (3, 3, "PAGE", "TEMPERATURE"),
+        (7, 8, "TEMPERATURE", "Q0"),
+        (9, 9, "TEMPERATURE", "Q1"),
+    )
+    for signal in signals.split()
+)
+"""Frames with one identifier and, in PAGE, what they contain; Q0 and Q1 are on pages of a page."""
+RAW_SIGNALS = {
+    "rate": {"signals": ["WX", "WY", "WZ"]},
+    "acceleration": {"signals": ["AX", "AY", "AZ"]},
+    "counter": {"signals": ["NUMBER"], "frame": "acceleration"},
+}
+
+
+@pytest.mark.parametrize("page", ["0|4@1+", "3|4@0+"])
+def test_multiplexed_signals_decode_as_cantools_does(tmp_path: Path, page: str) -> None:
+    pytest.importorskip("vqf")
+    cantools: Any = pytest.importorskip("cantools")
+    (tmp_path / "pages.dbc").write_text(PAGES.format(page=page))
+    message = cantools.database.load_file(tmp_path / "pages.dbc").get_message_by_name("RAW")
+    sent: list[dict[str, float]] = [
+        {"PAGE": 1, "NUMBER": 5, "WX": 1.25, "WY": -2.5, "WZ": 300.0},
+        {"PAGE": 3, "NUMBER": 5, "TEMPERATURE": 7, "Q0": 0},
+        {"PAGE": 2, "NUMBER": 5, "AX": 0.25, "AY": -0.5, "AZ": 0.875},
+    ]
+    frames = [CanFrame(at, 512, message.encode(each, strict=False)) for at, each in enumerate(sent)]
+    table = on_can(
+        RAW_SIGNALS,
+        dbc=str(tmp_path / "pages.dbc"),
+        ids={"rate": 512, "acceleration": 512},
+        orientation="gateway",
+    )
+    assert faults(table) == []
+    settings = parse_rig(rig_of(table)).sources[1].settings
+    assert isinstance(settings, CanTableSettings)
+    can_table = settings.can_table()
+    codec = CanTableCodec(can_table)
+    (sample,) = filter(None, map(codec.feed, frames))
+    assert isinstance(sample, CanSample)
+    scales = [can_table.fields[slot].scale for slot in codec.slots]
+    *rate, ax, ay, az, number = np.multiply(np.array(sample.values, float), scales)
+    assert np.rad2deg(rate) == pytest.approx([1.25, -2.5, 300.0])
+    assert np.divide([ax, ay, az], 9.80665) == pytest.approx([0.25, -0.5, 0.875])
+    assert (number, codec.foreign) == (5, 1)
+
+
+def test_signals_of_different_pages_in_one_frame_are_named(tmp_path: Path) -> None:
+    pytest.importorskip("cantools")
+    (tmp_path / "pages.dbc").write_text(PAGES.format(page="0|4@1+"))
+    table = on_can(RAW_SIGNALS, dbc=str(tmp_path / "pages.dbc"), ids={"all": 512})
+    text = "fields.acceleration: is not in the same frames as the rest of 'all'"
+    assert any(text in each for each in faults(table))
+    fields = RAW_SIGNALS | {"counter": {"signals": ["NUMBER"]}}
+    table = on_can(fields, dbc=table["dbc"], ids={"rate": 512, "acceleration": 512})
+    text = "fields.counter.frame: expected one of rate, acceleration, which have the identifier"
+    assert any(text in each for each in faults(table)), faults(table)
+
+
+def test_pages_of_a_page_are_found_by_both_multiplexers(tmp_path: Path) -> None:
+    pytest.importorskip("cantools")
+    (tmp_path / "pages.dbc").write_text(PAGES.format(page="0|4@1+"))
+    q0, q1 = read_signals(str(tmp_path / "pages.dbc"), ["Q0", "Q1"])
+    assert q0.multiplexer == Multiplexer(0xFF0F, frozenset({0x0703, 0x0803}))
+    assert q1.multiplexer == Multiplexer(0xFF0F, frozenset({0x0903}))
 
 
 def test_the_table_of_inertial_sense_decodes_a_message_as_its_documents_describe(

@@ -11,6 +11,7 @@ from jointfit_protocols.table import (
     CanSample,
     CanTable,
     CanTableCodec,
+    Multiplexer,
     TableField,
     encode_can_frames,
 )
@@ -77,3 +78,50 @@ def test_short_frames_are_corrupt_and_foreign_ones_counted() -> None:
     assert "first: 7 data bytes, expected 8" in short.reason
     assert codec.feed(CanFrame(0, 0x110, bytes(8), extended=True)) is None
     assert codec.foreign == 1
+
+
+@given(
+    st.integers(1, (1 << 16) - 1),
+    st.lists(st.integers(0, (1 << 16) - 1), min_size=2, max_size=5, unique=True),
+    st.data(),
+)
+def test_multiplexed_frames_are_found_by_the_bits_of_the_multiplexer(
+    mask: int, values: list[int], data: st.DataObject
+) -> None:
+    pages = [Multiplexer(mask, frozenset({value & mask})) for value in values]
+    table = CanTable(
+        ((0x200, False),) * len(pages),
+        {slot: TableField(2, "i", 24, frame=slot) for slot in range(len(pages))},
+        multiplexers=dict(enumerate(pages)),
+    )
+    codec = CanTableCodec(table)
+    numbers = [at * 1000 - 2000 for at in range(len(pages))]
+    sent = [CanFrame(1, 0x200, each) for _, each in encode_can_frames(table, numbers)]
+    noise = data.draw(st.integers(0, (1 << 16) - 1)) & ~mask
+    frames = [
+        frame._replace(
+            data=(int.from_bytes(frame.data, "little") | noise).to_bytes(len(frame.data), "little")
+        )
+        for frame in sent
+    ]
+    distinct = all(one.excludes(other) for at, one in enumerate(pages) for other in pages[:at])
+    assert distinct == (len({value & mask for value in values}) == len(values))
+    if distinct:
+        *rest, last = [codec.feed(frame) for frame in frames]
+        assert rest == [None] * len(rest)
+        assert isinstance(last, CanSample)
+        assert last.values == tuple(numbers)
+
+
+def test_an_unknown_page_is_foreign_and_a_short_one_corrupt() -> None:
+    table = CanTable(
+        ((0x200, False),),
+        {0: TableField(2, "f", 32)},
+        multiplexers={0: Multiplexer(0xFFFF, frozenset({0x0155}))},
+    )
+    codec = CanTableCodec(table)
+    assert codec.feed(CanFrame(0, 0x200, b"\x55\x02" + bytes(4))) is None
+    assert codec.feed(CanFrame(0, 0x200, b"\x55")) is None
+    assert codec.foreign == 2
+    assert isinstance(codec.feed(CanFrame(0, 0x200, b"\x55\x01" + bytes(3))), CorruptBytes)
+    assert isinstance(codec.feed(CanFrame(0, 0x200, b"\x55\x01" + bytes(4))), CanSample)
