@@ -149,23 +149,6 @@ def as_quaternion(q: Iterable[float]) -> Quaternion:
     return (float(w), float(x), float(y), float(z))
 
 
-def from_matrix_one(rows: Sequence[Sequence[float]]) -> Quaternion:
-    """Return the unit quaternion with w >= 0 of a rotation matrix (Shepperd 1978)."""
-    (a, b, c), (d, e, f), (g, h, i) = rows
-    # Each column of 4 q q^T is proportional to q; the longest column has the smallest rounding
-    # error.
-    q: Quaternion = (1.0 + a + e + i, h - f, c - g, d - b)
-    if a + e + i < 0.0:
-        if a >= e and a >= i:
-            q = (h - f, 1.0 + a - e - i, b + d, c + g)
-        elif e >= i:
-            q = (c - g, b + d, 1.0 + e - a - i, f + h)
-        else:
-            q = (d - b, c + g, f + h, 1.0 + i - a - e)
-    w, x, y, z = normalize_one(q)
-    return (-w, -x, -y, -z) if w < 0.0 else (w, x, y, z)
-
-
 def to_matrix_one(q: Quaternion) -> tuple[Vector, Vector, Vector]:
     """Return the rows of the rotation matrix of a unit quaternion."""
     w, x, y, z = q

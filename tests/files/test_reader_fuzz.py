@@ -20,7 +20,6 @@ from hypothesis import strategies as st
 
 from jointfit_daemon.files.captures import read_capture
 from jointfit_daemon.files.captures._capture import UnreadableCaptureError
-from jointfit_daemon.files.captures._packet_capture import read_udp
 from jointfit_daemon.files.mocap import MarkerTrajectories, c3d_bytes, read_trc, write_trc
 from jointfit_daemon.files.mocap._c3d import read_c3d
 from jointfit_daemon.files.models import read_osim
@@ -39,6 +38,7 @@ from jointfit_daemon.files.text import MalformedFileError
 from jointfit_simulators.body import SimulatedSubject, Step
 from jointfit_simulators.sample._sample_data import _write_models
 from jointfit_simulators.settings import Knobs
+from tests.captured_datagrams import read_udp
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

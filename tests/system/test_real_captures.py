@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from jointfit_daemon.files.captures._packet_capture import read_udp
 from jointfit_daemon.tools.child_processes import daemon
+from tests.captured_datagrams import read_udp
 from tests.simulators.natnet_replay import NatNetReplay
 from tests.simulators.xbus_replay import XbusReplay
 from tests.system.station import OUTCOMES, TOPICS, Listener, listening

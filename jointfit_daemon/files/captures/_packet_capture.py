@@ -118,11 +118,6 @@ def read_can(data: bytes) -> Iterator[CanPacket]:
         yield CanPacket(t_ns, number, b"" if remote else body[:size], extended, remote, error)
 
 
-def read_udp(data: bytes) -> Iterator[UdpPacket]:
-    """Yield the UDP datagrams of a pcapng or pcap file in file order."""
-    return (packet for packet in read_packets(data) if isinstance(packet, UdpPacket))
-
-
 def read_packets(data: bytes) -> Iterator[UdpPacket | TcpSegment]:
     """Yield the UDP datagrams and TCP segments of a pcapng or pcap file in file order."""
     fragments = _Fragments()

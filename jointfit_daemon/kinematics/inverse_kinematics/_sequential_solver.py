@@ -360,9 +360,3 @@ class _Place:
     @property
     def is_open(self) -> bool:
         return self.equations is None or self.equations.is_open
-
-
-def _straightened(state: ChainState) -> ChainState:
-    """Return the state with orthonormal rotations, by one Newton step towards A^T A = 1."""
-    A = state.rotations
-    return replace(state, rotations=1.5 * A - 0.5 * (A @ (A.swapaxes(-1, -2) @ A)))

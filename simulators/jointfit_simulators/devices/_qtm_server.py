@@ -201,10 +201,6 @@ class QtmServer:
         self.measuring, self._began_ns, self.number = True, None, 1
         self.report(event)
 
-    def loop_file(self) -> None:
-        """Begin the playback again; time stamps and frame numbers restart without an event."""
-        self._began_ns, self.number = None, 1
-
     def report(self, event: QtmEvent) -> None:
         """Send an event to all clients."""
         self._state = event

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import pytest
 
-from jointfit_daemon.files.captures._packet_capture import read_udp
 from jointfit_daemon.model import Chunk, ClockEcho
 from jointfit_daemon.timing.clock._echo_fit import EchoFit
 from jointfit_drivers.natnet import NatNetDecoder, NatNetSettings
 from jointfit_protocols.natnet import FrameOfData, decode
+from tests.captured_datagrams import read_udp
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

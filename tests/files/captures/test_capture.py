@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from jointfit_daemon.files.captures import read_capture
 from jointfit_daemon.files.captures._candump import read_candump
 from jointfit_daemon.files.captures._capture import UnreadableCaptureError
-from jointfit_daemon.files.captures._packet_capture import read_packets, read_udp
+from jointfit_daemon.files.captures._packet_capture import read_packets
 from jointfit_protocols.can import CanFrame, host_count, unpack_frames
 from jointfit_protocols.corrupt import CorruptBytes
+from tests.captured_datagrams import read_udp
 from tests.protocols.can.candump_oracle import parse_candump
 
 if TYPE_CHECKING:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from jointfit_daemon.files.captures._packet_capture import read_udp
 from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.natnet import (
     MARKER_OCCLUDED,
@@ -22,6 +21,7 @@ from jointfit_protocols.natnet import (
     decode_frame,
     encode,
 )
+from tests.captured_datagrams import read_udp
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
