@@ -16,6 +16,7 @@ from bench.experiments.joint_center.real_trials import METHODS, TRIALS
 from bench.framework.experiment import DATA
 from jointfit_daemon.center_of_rotation.planar import plane_of
 from jointfit_daemon.tools.plotting import new_figure
+from jointfit_daemon.units import MM_PER_M
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-_MM = 1000.0
 _MOST = 400
 _REACH_MM = 260.0
 _COLORS = ("tab:blue", "tab:orange")
@@ -54,14 +54,14 @@ def _title(found: EstimatedCenters) -> str:
     lines = [found.joint.name]
     for method in METHODS:
         e = found.estimates[method]
-        claimed = "refused" if e.refused else f"claimed ±{_MM * e.sd:.0f}"
+        claimed = "refused" if e.refused else f"claimed ±{MM_PER_M * e.sd:.0f}"
         claimed = "place along the axis unknown" if len(e.unseen) else claimed
         if not np.isfinite(e.center).all():
             lines.append(f"{method}: refused")
             continue
         lines.append(
-            f"{method}: {_MM * found.off(method):.0f} mm from the model,"
-            f" {_MM * found.off_axis(method):.0f} across;\n{claimed}"
+            f"{method}: {MM_PER_M * found.off(method):.0f} mm from the model,"
+            f" {MM_PER_M * found.off_axis(method):.0f} across;\n{claimed}"
         )
     return "\n".join(lines)
 
@@ -75,22 +75,22 @@ def _panel(
     origin = found.model @ view
     step = max(1, len(points) // _MOST)
     for k in range(points.shape[1]):
-        path = _MM * (points[::step, k] @ view - origin)
+        path = MM_PER_M * (points[::step, k] @ view - origin)
         axes.plot(*path.T, ".", color="0.7", markersize=2, label="markers" if k == 0 else None)
     turn = np.linspace(0.0, 2.0 * np.pi, 61)
-    rest = _MM * found.wander
+    rest = MM_PER_M * found.wander
     axes.plot(0.0, 0.0, "r+", markersize=12, label="model's center, mean")
     axes.plot(rest * np.cos(turn), rest * np.sin(turn), "r-", lw=0.8, label="its RMS wander")
     for color, method in zip(_COLORS, METHODS, strict=False):
         e = found.estimates[method]
         if not np.isfinite(e.center).all():
             continue
-        at = _MM * (e.center @ view - origin)
+        at = MM_PER_M * (e.center @ view - origin)
         faint = 0.35 if e.refused else 1.0
         inside = np.abs(at).max() <= _REACH_MM
         axes.plot(*at, "x", color=color, alpha=faint, markersize=9, mew=2, label=method)
         values, vectors = np.linalg.eigh(view.T @ e.covariance @ view)
-        lengths = _MM * np.sqrt(5.991 * np.maximum(values, 0.0))
+        lengths = MM_PER_M * np.sqrt(5.991 * np.maximum(values, 0.0))
         outline = vectors @ (lengths[:, None] * np.stack((np.cos(turn), np.sin(turn))))
         axes.plot(*(at[:, None] + outline), "-", color=color, alpha=faint, lw=1)
         if not inside:

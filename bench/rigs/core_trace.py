@@ -16,6 +16,7 @@ from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived
 from jointfit_daemon.pipeline.sources import StampedMeasurement
 from jointfit_daemon.timing.lag import estimate_lag
+from jointfit_daemon.units import NS_PER_S
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -31,8 +32,7 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-NS = 1_000_000_000
-LOOK_NS = NS // 2
+LOOK_NS = NS_PER_S // 2
 """Time between two records of the clocks, ns."""
 WINDOW_S, HOP_S = 10.0, 2.5
 
@@ -208,8 +208,8 @@ def _windows(
 ) -> list[LagWindow]:
     windows: list[LagWindow] = []
     begin_ns, end_ns = max(track[0][0], body[0][0]), min(track[0][-1], body[0][-1])
-    window_ns = round(WINDOW_S * NS)
-    for low in range(int(begin_ns), int(end_ns) - window_ns + 1, round(HOP_S * NS)):
+    window_ns = round(WINDOW_S * NS_PER_S)
+    for low in range(int(begin_ns), int(end_ns) - window_ns + 1, round(HOP_S * NS_PER_S)):
         imu, ref = _cut(track, low, low + window_ns), _cut(body, low, low + window_ns)
         if np.isfinite(ref[1]).all(axis=-1).any():
             windows.append(LagWindow(low + window_ns // 2, name, estimate_lag(*imu, *ref)))
@@ -233,7 +233,7 @@ def true_errors(
         unseen = unseen_ns.get(name, 0)
         if unseen:  # stamps already lack the assumed delay
             unseen -= trace.latency_ns[name]
-        t_s = np.array([(row.arrival_ns - trace.begin_ns) / NS for row in known])
+        t_s = np.array([(row.arrival_ns - trace.begin_ns) / NS_PER_S for row in known])
         error = [(row.t_ns - unseen - taken_ns[name, row.ticks or 0]) / 1e6 for row in known]
         errors[name] = (t_s, np.array(error), np.array([row.synced for row in known]))
     return errors

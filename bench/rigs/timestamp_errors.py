@@ -25,6 +25,7 @@ from jointfit_daemon.model import ImuSample, LimbState
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.sources import StampedMeasurement
 from jointfit_daemon.timing.clock import SLEW
+from jointfit_daemon.units import NS_PER_MS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.alignment import AlignedFrame
     from jointfit_daemon.timing.clock import Stamp
 
-_NS_PER_MS = 1e6
 OPTICAL = "mocap"
 MOST_NS = 2_000_000_000
 """Upper limit of the transport delay of a sample, ns."""
@@ -209,7 +209,7 @@ def judge(
     events: Iterable[Event], samples: Path, delay_ms: Mapping[str, float]
 ) -> tuple[ObservedCore, list[LimbState]]:
     """Return the observed core after all events, and its limb states."""
-    delays = {name: round(delay * _NS_PER_MS) for name, delay in delay_ms.items()}
+    delays = {name: round(delay * NS_PER_MS) for name, delay in delay_ms.items()}
     core = ObservedCore(Truth(samples), delays)
     states: list[LimbState] = []
     for event in events:

@@ -9,6 +9,7 @@ import math
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import Chunk
+from jointfit_daemon.units import NS_PER_S
 from jointfit_protocols import xbus, xcdi
 from jointfit_protocols.can import CanFrame, pack_frames, slcan
 from jointfit_protocols.natnet import ServerInfo, encode
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.model import Quaternion, Vector
 
-NS = 1_000_000_000
 TICK_NS = 100_000
 """Tick of the item SampleTimeFine of an MTi, ns."""
 BITSTREAM = (3, 1)
@@ -114,7 +114,7 @@ def natnet_datagrams(
     found = []
     for k in range(count):
         ticks = k * period_ns // 100
-        stamps = FrameStamps(k, k * period_ns / NS, ticks, ticks + 46_000, ticks + 60_000, 0)
+        stamps = FrameStamps(k, k * period_ns / NS_PER_S, ticks, ticks + 46_000, ticks + 60_000, 0)
         sway = 0.1 * math.sin(k / 20)
         markers = {
             name: (sway + 0.03 * i, 0.2 * i, 0.4 + sway)

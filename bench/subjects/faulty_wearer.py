@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.subjects.simulated_wearer import NS, bench_rig, phases
+from bench.subjects.simulated_wearer import bench_rig, phases
 from jointfit_daemon.calibration import CalibrationError
 from jointfit_daemon.calibration.phases import fit_calibration, fit_plate_alignment
 from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.units import NS_PER_S
 from jointfit_simulators.body import SENSORS, Rotation, SimulatedSubject, Step, from_wxyz, to_wxyz
 from jointfit_simulators.devices import Cameras, OrientationSensor
 from jointfit_simulators.settings import Knobs
@@ -148,7 +149,7 @@ def play(
     }
     states, reports = [], []
     for k, t_s in enumerate(person.t_s.tolist()):
-        t_ns = round((BEGIN_S + t_s) * NS)
+        t_ns = round((BEGIN_S + t_s) * NS_PER_S)
         samples = {name: q[k] for name, q in rows.items() if q[k][0] == q[k][0]}  # NaN is no sample
         states.append(fuser.fuse(t_ns, t_ns, k, samples))
         reports += [(t_s, report) for report in fuser.pop_reports(t_ns)]

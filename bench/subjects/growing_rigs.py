@@ -27,6 +27,7 @@ from jointfit_daemon.limb_model import (
 )
 from jointfit_daemon.model import Chunk
 from jointfit_daemon.pipeline.events import ChunkArrived
+from jointfit_daemon.units import NS_PER_S
 from jointfit_protocols.natnet import ServerInfo, encode
 from jointfit_simulators.devices import (
     FrameStamps,
@@ -42,9 +43,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.limb_model import SensorLink
     from jointfit_daemon.model import Chain, Quaternion, Vector
 
-NS = 1_000_000_000
 PERIOD_NS = 10_000_000
-BEGIN_NS = 1_000 * NS
+BEGIN_NS = 1_000 * NS_PER_S
 STAGGER_NS = 200_000
 """Time between the arrivals of two sensors in one frame, ns."""
 CAMERA_DELAY_NS = 9_000_000
@@ -81,7 +81,7 @@ class GrowingRig:
     def rig(self) -> Rig:
         """Return the rig, with ports that are never opened."""
         table: dict[str, Any] = {
-            "rig": {"name": "growth", "output_rate_hz": NS / PERIOD_NS},
+            "rig": {"name": "growth", "output_rate_hz": NS_PER_S / PERIOD_NS},
             "chain": {
                 "joints": [f"joint{i}" for i in range(1, self.segments + 2)],
                 "segments": self.segment_names,
@@ -93,7 +93,7 @@ class GrowingRig:
                     "driver": "xbus",
                     "port": f"/dev/{sensor}",
                     "baud": 921_600,
-                    "rate_hz": NS / PERIOD_NS,
+                    "rate_hz": NS_PER_S / PERIOD_NS,
                 }
                 for i, segment in enumerate(self.segment_names)
                 for sensor in self.sensor_names(i)
@@ -168,7 +168,7 @@ class GrowingRig:
 
 def swing(segment: int, number: int) -> Quaternion:
     """Return the orientation of a segment, which rotates about x, with small sensor noise."""
-    t_s = number * PERIOD_NS / NS
+    t_s = number * PERIOD_NS / NS_PER_S
     half = 0.5 * SWING * sin(2.0 * pi * SWING_HZ * t_s + segment) + 1e-5 * (number * 7919 % 97)
     return cos(half), sin(half), 0.0, 0.0
 

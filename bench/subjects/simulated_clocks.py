@@ -15,6 +15,7 @@ from bench.subjects.simulated_wearer import bench_rig
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.model import Chunk
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceOpened
+from jointfit_daemon.units import NS_PER_S
 from jointfit_protocols import xbus, xcdi
 from jointfit_protocols.can import CanFrame, pack_frames
 from jointfit_protocols.natnet import EchoRequest, EchoResponse, ServerInfo, encode
@@ -42,8 +43,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Event
     from jointfit_simulators.devices import PlannedSamples
 
-NS = 1_000_000_000
-BEGIN_NS = 5_000 * NS
+BEGIN_NS = 5_000 * NS_PER_S
 TICK_NS = 100_000
 SERVER_HZ = 10_000_000
 VERSION = (3, 1)
@@ -98,8 +98,11 @@ def simulated(seconds: float = 90.0, seed: int = 1) -> SimulatedRun:
         name: SampleTiming(knobs, name, latency_ms=_latency_ms(knobs, name), now_ns=BEGIN_NS)
         for name in (*SENSORS, "mocap")
     }
-    end_ns = BEGIN_NS + round(seconds * NS)
-    reboot_ns, gap_ns = BEGIN_NS + round(0.45 * seconds * NS), BEGIN_NS + round(0.7 * seconds * NS)
+    end_ns = BEGIN_NS + round(seconds * NS_PER_S)
+    reboot_ns, gap_ns = (
+        BEGIN_NS + round(0.45 * seconds * NS_PER_S),
+        BEGIN_NS + round(0.7 * seconds * NS_PER_S),
+    )
     taken = {name: _all(tickers[name], name, end_ns, reboot_ns, knobs) for name in tickers}
     seen = wearer.observe(
         [_seconds(taken[name][0]) for name in SENSORS],
@@ -109,7 +112,7 @@ def simulated(seconds: float = 90.0, seed: int = 1) -> SimulatedRun:
     made = _Made()
     for name, q in zip(SENSORS, seen.sensors, strict=True):
         said = OrientationSensor(knobs, name).report(_seconds(taken[name][0]), q)
-        hush = (gap_ns, gap_ns + NS // 2) if name == INTERRUPTED else (0, 0)
+        hush = (gap_ns, gap_ns + NS_PER_S // 2) if name == INTERRUPTED else (0, 0)
         _sensor(made, name, taken[name], said.tolist(), hush)
     _cameras(made, cameras, taken["mocap"], cameras.capture(seen))
     _echoes(made, tickers["mocap"], end_ns, knobs)
@@ -149,11 +152,11 @@ def _latency_ms(knobs: Knobs, name: str) -> float:
 
 
 def _seconds(t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-    return (t_ns - BEGIN_NS) / NS
+    return (t_ns - BEGIN_NS) / NS_PER_S
 
 
 def _all(ticker: SampleTiming, name: str, end_ns: int, reboot_ns: int, knobs: Knobs) -> Track:
-    period_ns = NS / (knobs.mocap_hz if name == "mocap" else knobs.rate_hz)
+    period_ns = NS_PER_S / (knobs.mocap_hz if name == "mocap" else knobs.rate_hz)
     if name != REBOOTED:
         return _track([ticker.samples(BEGIN_NS, end_ns, period_ns)])
     before = ticker.samples(BEGIN_NS, reboot_ns, period_ns)
@@ -210,7 +213,7 @@ def xbus_chunk(
             ]
         ),
     )
-    return due_ns + len(data) * 10 * NS // BAUD, data  # read with the last byte
+    return due_ns + len(data) * 10 * NS_PER_S // BAUD, data  # read with the last byte
 
 
 def xcdi_chunk(name: str, number: int, ticks: int, due_ns: int, q: Quaternion) -> tuple[int, bytes]:
@@ -241,8 +244,10 @@ def _cameras(made: _Made, cameras: Cameras, track: Track, frames: CameraFrames) 
     for number, (host, device, due, dropped) in enumerate(_rows(track)):
         if dropped:
             continue
-        exposure = device * SERVER_HZ // NS
-        stamps = FrameStamps(number, device / NS, exposure, exposure + 40_000, exposure + 50_000, 0)
+        exposure = device * SERVER_HZ // NS_PER_S
+        stamps = FrameStamps(
+            number, device / NS_PER_S, exposure, exposure + 40_000, exposure + 50_000, 0
+        )
         poses = {
             name: (tuple(at), tuple(q))
             for name, at, q in zip(cameras.bodies, places[number], turns[number], strict=True)
@@ -254,12 +259,12 @@ def _cameras(made: _Made, cameras: Cameras, track: Track, frames: CameraFrames) 
 
 def _echoes(made: _Made, ticker: SampleTiming, end_ns: int, knobs: Knobs) -> None:
     dice = knobs.random("echoes")
-    at_ns, stamp = BEGIN_NS + NS // 10, 0
+    at_ns, stamp = BEGIN_NS + NS_PER_S // 10, 0
     while at_ns < end_ns:
         stamp += 1
         there, back = (PATH_NS + round(dice.exponential(100_000)) for _ in range(2))
-        ticks = ticker.device_ns(at_ns + there) * SERVER_HZ // NS
+        ticks = ticker.device_ns(at_ns + there) * SERVER_HZ // NS_PER_S
         made.chunks.append((at_ns, "mocap", encode(EchoRequest(stamp), VERSION)))
         answer = encode(EchoResponse(stamp, ticks), VERSION)
         made.chunks.append((at_ns + there + back, "mocap", answer))
-        at_ns += NS // 20 if stamp < 10 else round(dice.uniform(0.8, 1.2) * NS)
+        at_ns += NS_PER_S // 20 if stamp < 10 else round(dice.uniform(0.8, 1.2) * NS_PER_S)

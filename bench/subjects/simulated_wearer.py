@@ -17,6 +17,7 @@ import numpy as np
 from jointfit_daemon.calibration import CalibrationTrial, OpticalTrack, SensorTrack
 from jointfit_daemon.calibration.phases import fit_calibration, fit_plate_alignment
 from jointfit_daemon.config import parse_rig
+from jointfit_daemon.units import NS_PER_S
 from jointfit_simulators.body import LIMBS, SENSORS, SimulatedSubject, Step
 from jointfit_simulators.devices import CameraFrames, Cameras, OrientationSensor
 from jointfit_simulators.scene import RigOptions, rig_toml
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion
     from jointfit_simulators.body import LegGeometry
 
-NS = 1_000_000_000
 MOVES = {
     "leg": ("functional", "walk", "squat", "sit_to_stand"),
     "legs": ("functional", "walk", "squat", "sit_to_stand"),
@@ -92,7 +92,7 @@ def phases_of(knobs: Knobs, limb: str = "leg", geometry: LegGeometry | None = No
 
 
 def _ns(t_s: Array) -> NDArray[np.int64]:
-    return np.round(t_s * NS).astype(np.int64)
+    return np.round(t_s * NS_PER_S).astype(np.int64)
 
 
 def _track(

@@ -9,11 +9,12 @@ from __future__ import annotations
 import time
 from typing import NamedTuple
 
+from jointfit_daemon.units import NS_PER_S
+
 STEP_NS = 50_000
 """Smallest change of the offset that counts as a step, in addition to the reading errors, ns."""
 _READINGS = 5
 """Number of readings per measurement. The reading with the shortest duration is used."""
-_NS_PER_S = 1_000_000_000
 
 
 class _OffsetReading(NamedTuple):
@@ -45,7 +46,7 @@ class UnixClock:
         if before is not None and now_ns < self._until_ns:
             return before.offset_ns
 
-        self._until_ns = now_ns + _NS_PER_S
+        self._until_ns = now_ns + NS_PER_S
         readings = []
         for _ in range(_READINGS):
             before_ns, unix_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.units import NS_PER_S
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion
@@ -23,7 +24,6 @@ MOVED_RAD = radians(45.0)
 """Smallest rotation between two rests, rad, so that a pause during the movement is not a rest."""
 _FEWEST = 5
 """Smallest number of samples in a rest."""
-_NS = 1_000_000_000
 
 
 class RestFinder:
@@ -45,10 +45,10 @@ class RestFinder:
         """
         recent = self._recent
         recent.append((t_ns, q_world_sensor))
-        while len(recent) > 1 and t_ns - recent[1][0] >= REST_S * _NS:
+        while len(recent) > 1 and t_ns - recent[1][0] >= REST_S * NS_PER_S:
             recent.popleft()
         begin_ns = recent[0][0]
-        if t_ns - begin_ns < REST_S * _NS or len(recent) < _FEWEST:
+        if t_ns - begin_ns < REST_S * NS_PER_S or len(recent) < _FEWEST:
             return None
 
         samples = np.array([q for _, q in recent])

@@ -11,11 +11,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.timing.alignment import FrameAligner
+from jointfit_daemon.units import NS_PER_S
 
 if TYPE_CHECKING:
     from jointfit_daemon.config import Rig
-
-_NS = 1_000_000_000
 
 
 class FrameGrid:
@@ -65,7 +64,9 @@ def _layout(rig: Rig) -> tuple[object, ...]:
 
 def _aligner(rig: Rig, begin_ns: int | None) -> FrameAligner:
     streams = {
-        source.id: round(_NS / source.rate_hz) for source in rig.sources if source.kind == "imu"
+        source.id: round(NS_PER_S / source.rate_hz)
+        for source in rig.sources
+        if source.kind == "imu"
     }
-    period_ns = round(_NS / rig.output_rate_hz)
+    period_ns = round(NS_PER_S / rig.output_rate_hz)
     return FrameAligner(streams, period_ns, mode=rig.align_mode, begin_ns=begin_ns)

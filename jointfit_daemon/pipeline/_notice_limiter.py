@@ -16,12 +16,12 @@ from types import MappingProxyType
 from jointfit_daemon.model import Corrupt, DeviceEvent
 from jointfit_daemon.pipeline.events import Notice, NoticeKind, NoticeLevel
 from jointfit_daemon.pipeline.health import MOST_LOST
+from jointfit_daemon.units import NS_PER_S
 
 QUIET_NS = 60_000_000_000
 """Shortest time between two notices of the same device and kind, ns. The counts in
 ``bridge/health`` include all events."""
 
-_NS_PER_S = 1_000_000_000
 
 STEP_NS = 2_000_000
 """Smallest step of UNIX time that is reported, ns. The corrections by NTP are smaller."""
@@ -93,7 +93,7 @@ class NoticeLimiter:
                 notices.append(_notice(now_ns, key, condition))
             elif condition.lasting:
                 what = "no samples lost" if kind == "gap" else "no bytes discarded"
-                text = f"{what} for {(now_ns - condition.reported_ns) / _NS_PER_S:.0f} s"
+                text = f"{what} for {(now_ns - condition.reported_ns) / NS_PER_S:.0f} s"
                 data = _totals(kind, condition)
                 notices.append(
                     Notice(now_ns, NoticeKind.WIRE, source, text, NoticeLevel.INFO, data)
@@ -105,7 +105,7 @@ class NoticeLimiter:
 def _notice(now_ns: int, key: tuple[str, str], condition: _Condition) -> Notice:
     """Return the notice of a condition, and start the waiting time until its next notice."""
     source, kind = key
-    level, elapsed_s = NoticeLevel.WARNING, (now_ns - condition.reported_ns) / _NS_PER_S
+    level, elapsed_s = NoticeLevel.WARNING, (now_ns - condition.reported_ns) / NS_PER_S
     if kind in _JUMPS:
         text, data = condition.text, dict(condition.data)
         if condition.count > 1:
@@ -120,7 +120,7 @@ def _notice(now_ns: int, key: tuple[str, str], condition: _Condition) -> Notice:
         if kind == "gap":
             # There is no interval before the first notice, so lost samples are compared with one
             # minute of data.
-            interval_s = elapsed_s if condition.lasting else QUIET_NS / _NS_PER_S
+            interval_s = elapsed_s if condition.lasting else QUIET_NS / NS_PER_S
             share = condition.amount / (condition.rate_hz * interval_s)
             text = f"{text} ({100 * share:.2f} %)" if condition.lasting else text
             level = NoticeLevel.WARNING if share > MOST_LOST else NoticeLevel.INFO

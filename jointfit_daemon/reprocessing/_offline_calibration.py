@@ -18,6 +18,7 @@ from jointfit_daemon.pipeline.events import (
 )
 from jointfit_daemon.reprocessing._errors import ReprocessingError
 from jointfit_daemon.reprocessing._processing import Changes, process_events
+from jointfit_daemon.units import NS_PER_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import Rig
     from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.pipeline.events import Event
-
-_NS_PER_S = 1e9
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,14 +118,14 @@ class _CalibrationRun:
         """Store a new calibration with the date of the session, as the daemon does."""
         self.calibration, self.rejected = ready.calibration, None
         if not ready.keep_date and self.offset_ns is not None:
-            unix_s = (self.now_ns + self.offset_ns) / _NS_PER_S
+            unix_s = (self.now_ns + self.offset_ns) / NS_PER_S
             date = datetime.datetime.fromtimestamp(unix_s, datetime.UTC)
             text = date.isoformat(timespec="seconds")
             self.calibration = replace(ready.calibration, created_utc=text)
 
     def add_status(self, status: CalibrationStatus) -> None:
         """Report a status, and store the quality of a result."""
-        self.report((status.t_ns - self.begin_ns) / _NS_PER_S, status)
+        self.report((status.t_ns - self.begin_ns) / NS_PER_S, status)
         if status.kept is not None:
             self.rejected, self.quality = status.kept, status.refused
         elif status.phase in (CalibrationPhase.POSED, CalibrationPhase.CALIBRATED):

@@ -24,6 +24,7 @@ from jointfit_daemon.session_data import (
     SessionData,
     TimelineEvent,
 )
+from jointfit_daemon.units import NS_PER_S
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Event, Output
     from jointfit_daemon.pipeline.health import CoreHealth
 
-_NS_PER_S = 1e9
 _UNKNOWN_Q = (nan,) * 4
 _UNKNOWN_VECTOR = (nan,) * 3
 
@@ -61,7 +61,7 @@ class _Rows:
 
     def t_s(self, begin_ns: int) -> Array:
         """Return the instants since `begin_ns`, s, shape (n,)."""
-        times: Array = (np.array(self._t_ns, dtype=np.int64) - begin_ns) / _NS_PER_S
+        times: Array = (np.array(self._t_ns, dtype=np.int64) - begin_ns) / NS_PER_S
         return times
 
     def columns(self, first: int, count: int) -> Array:
@@ -235,7 +235,7 @@ class SessionCollector:
             ),
             events=tuple(
                 TimelineEvent(
-                    (t_ns - begin_ns) / _NS_PER_S, item.kind, item.id, item.text, item.data
+                    (t_ns - begin_ns) / NS_PER_S, item.kind, item.id, item.text, item.data
                 )
                 for t_ns, item in timeline
             ),
@@ -282,4 +282,4 @@ def _marker_series(frames: Sequence[tuple[int, MocapFrame]], begin_ns: int) -> M
     for row, (_, frame) in enumerate(frames):
         positions[row, columns[frame.layout]] = frame.markers
     stamps = np.array([t_ns for t_ns, _ in frames], dtype=np.int64)
-    return MarkerSeries(labels, (stamps - begin_ns) / _NS_PER_S, positions)
+    return MarkerSeries(labels, (stamps - begin_ns) / NS_PER_S, positions)

@@ -26,6 +26,7 @@ from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured
 from jointfit_daemon.reprocessing._errors import ReprocessingError
 from jointfit_daemon.session_data import interpolate_orientations
+from jointfit_daemon.units import NS_PER_S
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -45,7 +46,6 @@ TOLERATED_SHARE = 0.99
 """Share of the orientations that must be within the tolerance. Orientations near a lost frame may
 differ by more."""
 _OUTPUT = "output/"
-_NS_PER_S = 1e9
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,7 +222,7 @@ class _ByteComparison:
     @property
     def seconds(self) -> float:
         """Time since the first event, s."""
-        return (self.now_ns - (self.begin_ns or 0)) / _NS_PER_S
+        return (self.now_ns - (self.begin_ns or 0)) / NS_PER_S
 
 
 def _verify_bytes(recording: Recording) -> Verification:
@@ -258,7 +258,7 @@ def _check_begins_with_configuration(begin_ns: int | None, event: Event) -> None
 
 
 def _gap_text(gap: RecordingGap, begin_ns: int | None) -> str:
-    at_s = (gap.from_t_ns - (begin_ns or gap.from_t_ns)) / _NS_PER_S
+    at_s = (gap.from_t_ns - (begin_ns or gap.from_t_ns)) / NS_PER_S
     return f"at {at_s:.3f} s: {gap.text()}"
 
 
@@ -302,7 +302,7 @@ class _Orientations:
     def arrays(self, begin_ns: int) -> dict[str, tuple[Array, Array]]:
         """Return instants, s, shape (n,), and orientations, shape (n, 4), by segment."""
         return {
-            name: ((np.array(stamps, dtype=np.int64) - begin_ns) / _NS_PER_S, np.array(rows))
+            name: ((np.array(stamps, dtype=np.int64) - begin_ns) / NS_PER_S, np.array(rows))
             for name, (stamps, rows) in self._rows.items()
             if rows
         }
@@ -316,7 +316,7 @@ def _verify_orientations(recording: Recording) -> Verification:
     for item in recording.messages():
         if isinstance(item, RecordingGap):
             gaps.append(_gap_text(item, begin_ns))
-            core, quiet_ns = Core(), item.to_t_ns + round(WARM_UP_S * _NS_PER_S)
+            core, quiet_ns = Core(), item.to_t_ns + round(WARM_UP_S * NS_PER_S)
             continue
         now_ns = max(now_ns, item.t_ns)
         if item.channel == STATE:
@@ -327,7 +327,7 @@ def _verify_orientations(recording: Recording) -> Verification:
         elif (event := item.event()) is not None:
             _check_begins_with_configuration(begin_ns, event)
             if begin_ns is None:
-                begin_ns, quiet_ns = item.t_ns, item.t_ns + round(WARM_UP_S * _NS_PER_S)
+                begin_ns, quiet_ns = item.t_ns, item.t_ns + round(WARM_UP_S * NS_PER_S)
             replayed.add_replayed(core.feed(event))
 
     begin_ns = begin_ns or 0
@@ -338,7 +338,7 @@ def _verify_orientations(recording: Recording) -> Verification:
         float(np.median(errors)) if errors.size else float("nan"),
         float(errors.max()) if errors.size else float("nan"),
     )
-    seconds = (now_ns - begin_ns) / _NS_PER_S
+    seconds = (now_ns - begin_ns) / NS_PER_S
     return Verification(seconds, {}, None, tuple(gaps), None, found, recording.info.program)
 
 

@@ -11,6 +11,7 @@ import time
 from typing import TYPE_CHECKING, Protocol
 
 from jointfit_daemon.pipeline.events import Tick, UnixOffset
+from jointfit_daemon.units import NS_PER_S
 
 if TYPE_CHECKING:
     from jointfit_daemon.outputs.sink import Sink
@@ -24,7 +25,6 @@ LONGEST_TICK_INTERVAL_NS = 100_000_000
 _SHORTEST_WAIT_NS = 1_000_000
 """Shortest wait for a deadline, ns. Without it, a deadline that stays in the past would block the
 event loop."""
-_NS_PER_S = 1e9
 
 
 class CoreInterface(Protocol):
@@ -99,7 +99,7 @@ class CoreRunner:
             if self._timer is not None:
                 self._timer.cancel()
             self._timer_ns = due_ns
-            self._timer = self._loop.call_at(due_ns / _NS_PER_S, self._tick)
+            self._timer = self._loop.call_at(due_ns / NS_PER_S, self._tick)
 
     def _tick(self) -> None:
         self._timer = None

@@ -43,6 +43,7 @@ from unittest import SkipTest
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError, Settings
 from jointfit_daemon.model import Chunk, Corrupt, ImuSample
+from jointfit_daemon.units import NS_PER_S
 from jointfit_simulators._contract_fixtures import (
     DecodingReceiver,
     SwitchableNoise,
@@ -66,7 +67,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.driver import Driver
     from jointfit_simulators.imu_device import WireNoise
 
-_NS = 10**9
 _BITS = 10
 """Number of bits per byte on a serial line (8N1)."""
 _INCOMPLETE = 3
@@ -75,7 +75,7 @@ _DELIVERY_S = 0.05
 """Time in which the kernel delivers written bytes to the reader, s."""
 _PAUSE_NS = 200_000_000
 """Longest pause within a message on a busy host, ns."""
-_SILENCE_NS = 60 * _NS
+_SILENCE_NS = 60 * NS_PER_S
 """Time without bytes after which an incomplete message is lost at any line speed, ns."""
 
 
@@ -126,7 +126,7 @@ class DriverContract(ABC):
         """
         rate_hz = getattr(device, "rate_hz", None) or self.rate_hz
         last, last_ns = self.__dict__.setdefault("_device_times", {}).get(id(device), (-1, 0))
-        t_ns = int(last_ns + max(1, number - last) * _NS / rate_hz)
+        t_ns = int(last_ns + max(1, number - last) * NS_PER_S / rate_hz)
         self.__dict__["_device_times"][id(device)] = number, t_ns
         return t_ns
 
@@ -242,7 +242,7 @@ class DriverContract(ABC):
 
         async def scene() -> None:
             driver, data, t_ns, _ = await self._record(tmp_path)
-            byte_ns = _BITS * _NS / (self.baud or _NS)
+            byte_ns = _BITS * NS_PER_S / (self.baud or NS_PER_S)
 
             # The same bytes arrive twice: one by one at the line speed, and in one chunk.
             single = DecodingReceiver(driver, self.measurement)

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jointfit_daemon.units import NS_PER_S
 from jointfit_simulators.body import CLUSTERS, SENSORS, SimulatedSubject, parse_motion_script
 from jointfit_simulators.body._random_signal import RandomSignal
 from jointfit_simulators.body._soft_tissue import SoftTissue
-from jointfit_simulators.devices import NS, CameraFrames, Cameras, OrientationSensor, SampleTiming
+from jointfit_simulators.devices import CameraFrames, Cameras, OrientationSensor, SampleTiming
 from jointfit_simulators.settings import Knobs, apply_settings, perfect
 from jointfit_simulators.wires import line_noise
 
@@ -164,8 +165,13 @@ def test_clock_errors_are_within_their_bounds() -> None:
     skews, now = [], 10**13
     for name in "abcdefghijkl":
         timing = SampleTiming(Knobs(), name, latency_ms=2.0, now_ns=now)
-        samples = timing.samples(now, now + 100 * NS, NS / 100)
-        gained = np.polyfit((samples.host_ns - now) / NS, (samples.device_ns - now) / NS, 1)[0] - 1
+        samples = timing.samples(now, now + 100 * NS_PER_S, NS_PER_S / 100)
+        gained = (
+            np.polyfit((samples.host_ns - now) / NS_PER_S, (samples.device_ns - now) / NS_PER_S, 1)[
+                0
+            ]
+            - 1
+        )
         assert gained == pytest.approx(timing.clock.skew, abs=2e-7)
         skews.append(gained * 1e6)
         jitter = samples.device_ns - (samples.host_ns - timing.clock.boot_ns) * (
@@ -185,8 +191,8 @@ def test_blocks_contain_every_sample_once() -> None:
     whole = SampleTiming(Knobs(), "a", latency_ms=0.0, now_ns=10**12)
     blocks = SampleTiming(Knobs(), "a", latency_ms=0.0, now_ns=10**12)
     edges = 10**12 + np.cumsum(np.r_[0, np.random.default_rng(1).integers(1, 10**8, 200)])
-    parts = [blocks.samples(a, b, NS / 400).host_ns for a, b in pairwise(edges)]
-    once = whole.samples(edges[0], edges[-1], NS / 400).host_ns
+    parts = [blocks.samples(a, b, NS_PER_S / 400).host_ns for a, b in pairwise(edges)]
+    once = whole.samples(edges[0], edges[-1], NS_PER_S / 400).host_ns
     np.testing.assert_array_equal(np.concatenate(parts), once)
 
 

@@ -10,8 +10,9 @@ from typing import Any
 import orjson
 import pytest
 
+from jointfit_daemon.units import NS_PER_S
 from jointfit_simulators.body import SimulatedSubject, parse_motion_script
-from jointfit_simulators.devices import NS, ClockFault, SampleTiming
+from jointfit_simulators.devices import ClockFault, SampleTiming
 from jointfit_simulators.scene import InvalidCommandError, Scene, SceneOptions
 from jointfit_simulators.scene._sample_log import SampleLog
 from jointfit_simulators.settings import Knobs
@@ -23,11 +24,11 @@ NOW = 10**13
 def test_prescribed_clock_has_its_skew_and_uptime() -> None:
     timing = SampleTiming(Knobs(), "S1", latency_ms=2.0, now_ns=NOW)
     timing.set_fault(ClockFault.parse("50,3600"), NOW)
-    assert timing.device_ns(NOW) == pytest.approx(3600 * NS * (1 + 50e-6), abs=1)
-    hour_later = timing.device_ns(NOW + 3600 * NS) - timing.device_ns(NOW)
-    assert hour_later == pytest.approx(3600 * NS + 3600 * 50_000, abs=2)
-    timing.reboot(NOW + NS)
-    assert timing.device_ns(NOW + 2 * NS) == pytest.approx(NS, abs=60_000)
+    assert timing.device_ns(NOW) == pytest.approx(3600 * NS_PER_S * (1 + 50e-6), abs=1)
+    hour_later = timing.device_ns(NOW + 3600 * NS_PER_S) - timing.device_ns(NOW)
+    assert hour_later == pytest.approx(3600 * NS_PER_S + 3600 * 50_000, abs=2)
+    timing.reboot(NOW + NS_PER_S)
+    assert timing.device_ns(NOW + 2 * NS_PER_S) == pytest.approx(NS_PER_S, abs=60_000)
 
 
 def test_prescribed_skew_keeps_the_random_uptime() -> None:

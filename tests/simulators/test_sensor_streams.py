@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jointfit_daemon.units import NS_PER_S
 from jointfit_simulators.body._recorded_trial import InterpolatedTrack
-from jointfit_simulators.devices import NS
 from jointfit_simulators.scene._streams import ImuStream
 from jointfit_simulators.settings import Knobs, apply_settings, perfect
 
@@ -60,10 +60,10 @@ def stream(knobs: Knobs, device: StoringDevice, *, shared: bool = False) -> ImuS
 
 def play(source: ImuStream, seconds: int, begin_s: int = 0, *, sending: bool = True) -> int:
     """Send some seconds of upright stance; return the number of samples taken."""
-    begin = NOW + begin_s * NS
-    instants = source.plan(begin, begin + seconds * NS)
-    assert np.all((instants >= begin) & (instants < begin + seconds * NS))
-    due = source.fill(instants / NS, np.tile(UPRIGHT, (len(instants), 1)))
+    begin = NOW + begin_s * NS_PER_S
+    instants = source.plan(begin, begin + seconds * NS_PER_S)
+    assert np.all((instants >= begin) & (instants < begin + seconds * NS_PER_S))
+    due = source.fill(instants / NS_PER_S, np.tile(UPRIGHT, (len(instants), 1)))
     for _ in due:
         source.emit(sending=sending)
     return len(due)
@@ -112,8 +112,8 @@ def test_stamps_are_device_times_of_the_true_instants() -> None:
     source = stream(
         apply_settings(perfect(Knobs()), ["clock_skew_ppm=50", "latency_jitter_ms=5"]), device
     )
-    instants = source.plan(NOW, NOW + 10 * NS)
-    for _ in source.fill(instants / NS, np.tile(UPRIGHT, (len(instants), 1))):
+    instants = source.plan(NOW, NOW + 10 * NS_PER_S)
+    for _ in source.fill(instants / NS_PER_S, np.tile(UPRIGHT, (len(instants), 1))):
         source.emit()
     clock = source.timing.clock
     shown = [clock.device_ns(int(t)) for t in instants]

@@ -17,7 +17,7 @@ import numpy as np
 from bench.framework.experiment import Experiment, Result
 from bench.framework.material import SIMULATED_SUBJECTS
 from bench.subjects.faulty_wearer import SubjectRecording, play
-from bench.subjects.simulated_wearer import NS, bench_rig
+from bench.subjects.simulated_wearer import bench_rig
 from jointfit_daemon.calibration import (
     CalibrationError,
     CalibrationTrial,
@@ -35,6 +35,7 @@ from jointfit_daemon.calibration.phases import (
 from jointfit_daemon.calibration.registration import sensor_at
 from jointfit_daemon.fusion import LimbFuser
 from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.units import NS_PER_S
 from jointfit_simulators.body import SENSORS, SimulatedSubject, Step, to_wxyz
 from jointfit_simulators.devices import Cameras, OrientationSensor
 from jointfit_simulators.settings import Knobs
@@ -82,8 +83,8 @@ class Person:
     def trial(self, begin_s: float, end_s: float) -> CalibrationTrial:
         """Return the trial that a calibration phase records."""
         now = (self.t_s >= begin_s) & (self.t_s < end_s)
-        t_ns = np.round(self.t_s[now] * NS).astype(np.int64)
-        shot = (self.optical.t_ns >= begin_s * NS) & (self.optical.t_ns < end_s * NS)
+        t_ns = np.round(self.t_s[now] * NS_PER_S).astype(np.int64)
+        shot = (self.optical.t_ns >= begin_s * NS_PER_S) & (self.optical.t_ns < end_s * NS_PER_S)
         sensors = {name: SensorTrack(t_ns, q[now]) for name, q in self.said.items()}
         return CalibrationTrial(sensors, _cut(self.optical, shot))
 
@@ -113,7 +114,7 @@ def person(seed: int) -> Person:
     cameras = Cameras(knobs, wearer, rate_hz=RATE_HZ)
     frames = cameras.capture(seen)
     optical = OpticalTrack(
-        np.round(camera_s * NS).astype(np.int64),
+        np.round(camera_s * NS_PER_S).astype(np.int64),
         cameras.markers,
         frames.markers,
         cameras.bodies,

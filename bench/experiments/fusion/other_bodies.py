@@ -24,6 +24,7 @@ from bench.framework.experiment import Experiment, Result
 from bench.framework.material import SIMULATED_SUBJECTS
 from bench.subjects.simulated_wearer import bench_rig, phases_of
 from jointfit_daemon.calibration.phases import fit_calibration, fit_plate_alignment
+from jointfit_daemon.units import MM_PER_M
 from jointfit_simulators.body import LegGeometry
 from jointfit_simulators.settings import Knobs
 
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
 
 SEEDS = tuple(range(9001, 9007))
 METHODS: tuple[Method, ...] = ("anchored", "mean")
-_MM = 1000.0
 
 
 def drawn_body(seed: int) -> tuple[Knobs, LegGeometry]:
@@ -85,7 +85,7 @@ def other_bodies(_: Path) -> list[Result]:
             found[method].append(errors_of(calibration, live))
         for name, truth in (("thigh", geometry.thigh_m), ("shank", geometry.shank_m)):
             length = fits["anchored"].segment[name].length
-            off_mm.append(inf if length is None else _MM * abs(length - truth))
+            off_mm.append(inf if length is None else MM_PER_M * abs(length - truth))
 
     errors, means = found["anchored"], found["mean"]
     figures = [Result("subjects accepted", len(errors), len(SEEDS), len(SEEDS) - 1, unit="")]

@@ -16,13 +16,14 @@ import numpy as np
 from bench.experiments.fusion.simulated_leg import take_pose
 from bench.framework.experiment import Experiment, Result
 from bench.framework.material import SIMULATED_SUBJECTS
-from bench.subjects.simulated_wearer import NS, bench_rig, phases
+from bench.subjects.simulated_wearer import bench_rig, phases
 from jointfit_daemon.calibration.phases import fit_calibration, fit_plate_alignment
 from jointfit_daemon.fusion import LimbFuser
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.joint_angles import read_joint
 from jointfit_daemon.limb_model import flexion_sign, inner_joints, is_left
 from jointfit_daemon.model import AngleConvention
+from jointfit_daemon.units import NS_PER_S
 from jointfit_simulators.body import SimulatedSubject, Step, to_wxyz
 from jointfit_simulators.devices import Cameras, OrientationSensor
 from jointfit_simulators.settings import Knobs
@@ -101,7 +102,7 @@ def _live(limb: str, rig: Rig, seed: int) -> _Live | None:
     }
     fuser = LimbFuser(rig.chain, calibration)
     states = []
-    for i, t_ns in enumerate(np.round(t_s * NS).astype(int).tolist()):
+    for i, t_ns in enumerate(np.round(t_s * NS_PER_S).astype(int).tolist()):
         sensors = {name: tuple(q[i]) for name, q in said.items()}
         states.append(fuser.fuse(t_ns, t_ns, i, sensors))
     bones = {part: to_wxyz(world * q) for part, q in seen.truth.orientations.items()}

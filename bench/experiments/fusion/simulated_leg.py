@@ -27,6 +27,7 @@ from jointfit_daemon.calibration.phases import (
 )
 from jointfit_daemon.fusion import LimbFuser
 from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.units import NS_PER_S
 from jointfit_simulators.body import SENSORS, SimulatedSubject, Step, to_wxyz
 from jointfit_simulators.devices import Cameras, OrientationSensor
 from jointfit_simulators.settings import Knobs
@@ -51,7 +52,6 @@ later than the calibration."""
 LIVE = (("walk", 8.0), ("squat", 8.0), ("sit_to_stand", 8.0))
 RATE_HZ = 50.0
 KNEE_GOAL_DEG = 3.0
-NS = 1_000_000_000
 _STILL_S = np.arange(3.0, 8.0, 0.1)  # standing subject
 
 
@@ -103,7 +103,7 @@ def live_of(knobs: Knobs, geometry: LegGeometry | None = None) -> Live:
     }
     world = Cameras(knobs, wearer, rate_hz=knobs.mocap_hz).world
     return Live(
-        np.round(t_s * NS).astype(int).tolist(),
+        np.round(t_s * NS_PER_S).astype(int).tolist(),
         said,
         {name: to_wxyz(world * seen.truth.orientations[name]) for name in SEGMENTS},
         seen.truth.angles[:, 0],
@@ -173,7 +173,7 @@ def people(seeds: tuple[int, ...] = SEEDS) -> Mapping[Method, list[Errors]]:
 def take_pose(static: CalibrationTrial, rig: Rig) -> StaticPose | None:
     """Return the accepted static pose; None if the daemon would request another pose."""
     until_ns = min(int(track.t_ns[0]) for track in static.sensors.values())
-    until_ns += round(rig.calibration.static_s * NS)
+    until_ns += round(rig.calibration.static_s * NS_PER_S)
     optical = static.optical
     if optical is None:
         return None

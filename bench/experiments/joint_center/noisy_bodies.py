@@ -14,6 +14,7 @@ from bench.subjects.noisy_bodies import Subject
 from bench.subjects.simulated_joints import covers
 from jointfit_daemon.center_of_rotation import estimate_center
 from jointfit_daemon.center_of_rotation.planar import CircleLimits, circle_estimate
+from jointfit_daemon.units import MM_PER_M
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.center_of_rotation import CenterEstimate
 
 
-MM = 1000.0
 SUBJECTS = 8
 RUNS = 125
 """Number of runs per subject. The coverage of 1000 runs has a standard error of 0.7 %."""
@@ -49,7 +49,7 @@ def estimates(
 
 
 def rms_mm(found: Iterable[CenterEstimate]) -> float:
-    return MM * float(np.sqrt(np.mean([e.center @ e.center for e in found])))
+    return MM_PER_M * float(np.sqrt(np.mean([e.center @ e.center for e in found])))
 
 
 def held_percent(found: Iterable[CenterEstimate]) -> float:
@@ -61,7 +61,7 @@ def measure_noise(runs: int) -> list[Result]:
     results = []
     for rom, markers, noise in product(ANGLES_DEG, (3, 4), (0.5e-3, 1e-3, 2e-3)):
         people = estimates(rom, markers, (noise, 0.0), runs)
-        label = f"{rom:g}°, {markers} markers, noise {MM * noise:g} mm"
+        label = f"{rom:g}°, {markers} markers, noise {MM_PER_M * noise:g} mm"
         together = [e for person in people for e in person]
         held = [held_percent(person) for person in people]
         errors = [rms_mm(person) for person in people]
@@ -96,7 +96,7 @@ def measure_soft_tissue(runs: int) -> list[Result]:
     results = []
     for rom, markers, soft_tissue in product(ANGLES_DEG, (3, 4), (1e-3, 3e-3)):
         people = estimates(rom, markers, (3e-4, soft_tissue), runs)
-        label = f"{rom:g}°, {markers} markers, artefact {MM * soft_tissue:g} mm"
+        label = f"{rom:g}°, {markers} markers, artefact {MM_PER_M * soft_tissue:g} mm"
         used = [[e for e in person if e.refused is None] for person in people]
         errors = [rms_mm(person) for person in used if person]
         rejected = 100.0 * (1.0 - sum(map(len, used)) / sum(map(len, people)))
@@ -122,7 +122,7 @@ def measure_gate(runs: int) -> list[Result]:
         found = [circle_estimate(points, limits=CircleLimits(sd=limit)) for points in trials]
         used = [e for e in found if e.refused is None]
         rejected = 100.0 * (1.0 - len(used) / runs)
-        outward = MM * float(np.mean([e.center[0] for e in used]))
+        outward = MM_PER_M * float(np.mean([e.center[0] for e in used]))
         bounds = (97.0, 93.0) if limit == inf else (inf, -inf)
         results += [
             Result(f"{label}: rejected", rejected, inf, unit="%"),

@@ -39,6 +39,7 @@ from jointfit_daemon.center_of_rotation.spatial import (
     relative,
     spatial_noise,
 )
+from jointfit_daemon.units import MM_PER_M
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -48,7 +49,6 @@ if TYPE_CHECKING:
 
     Paths = Callable[[np.random.Generator], Array]
 
-MM = 1000.0
 NOISE = 1e-3
 """Standard deviation of the noise of every coordinate, m."""
 
@@ -133,10 +133,10 @@ def ball_joint(rom: float, goals: tuple[float, ...], runs: int = 200) -> list[Re
     size, kind = (upper_rms, ", upper 95 % confidence limit") if runs >= 1000 else (rms, "")
     return [
         *(
-            Result(f"{name}{kind}", MM * size(found), room * goal, unit="mm")
+            Result(f"{name}{kind}", MM_PER_M * size(found), room * goal, unit="mm")
             for (name, found), goal in zip(errors.items(), goals, strict=True)
         ),
-        Result("Cramér-Rao bound", MM * float(np.sqrt(np.mean(bounds))), inf, unit="mm"),
+        Result("Cramér-Rao bound", MM_PER_M * float(np.sqrt(np.mean(bounds))), inf, unit="mm"),
     ]
 
 
@@ -159,7 +159,7 @@ def hinge_axis(_: Path) -> list[Result]:
         told += found.sd == inf
     return [
         Result("direction", float(np.degrees(np.sqrt(np.mean(np.square(angle))))), 0.4),
-        Result("offset", MM * rms(off), 1.6, unit="mm"),
+        Result("offset", MM_PER_M * rms(off), 1.6, unit="mm"),
         near("share with unbounded variance along the axis", told / 200, 1.0, 0.0, unit=""),
     ]
 

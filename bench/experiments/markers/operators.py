@@ -18,6 +18,7 @@ from jointfit_daemon.calibration.marker_refinement import (
 )
 from jointfit_daemon.kinematics.chains import marker_positions, step_between
 from jointfit_daemon.kinematics.inverse_kinematics import solve_frames
+from jointfit_daemon.units import MM_PER_M
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,7 +35,6 @@ NOISE_M = 0.001
 _EVERY = {"walking1": 2, "squats1": 20, "DJ1": 4}
 _TRAINED = ("walking1", "squats1")
 _UNSEEN = "DJ1"
-_MM = 1000.0
 
 
 def _movements(data: Path) -> dict[str, ChainState]:
@@ -87,8 +87,8 @@ def team(
     trained = [float(np.mean([spread_deg(errors[name][k]) for name in _TRAINED])) for k in (0, 1)]
     later = [spread_deg(errors[_UNSEEN][k]) for k in (0, 1)]
     return {
-        "marker position error": (_MM * float(before), _MM * float(after)),
-        "tracking error, unseen movement": (_MM * float(old), _MM * float(new)),
+        "marker position error": (MM_PER_M * float(before), MM_PER_M * float(after)),
+        "tracking error, unseen movement": (MM_PER_M * float(old), MM_PER_M * float(new)),
         "joint angles between operators, trained movements": (trained[0], trained[1]),
         "joint angles between operators, unseen movement": (later[0], later[1]),
     }

@@ -27,6 +27,7 @@ from jointfit_daemon.calibration.marker_refinement import (
 )
 from jointfit_daemon.kinematics.chains import marker_positions, step_between
 from jointfit_daemon.kinematics.inverse_kinematics import solve_frames
+from jointfit_daemon.units import MM_PER_M
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration.marker_refinement import Refinement
     from jointfit_daemon.kinematics.chains import ChainModel, ChainState
 
-_MM = 1000.0
 _EVERY = {"walking1": 1, "squats1": 8, "DJ1": 2, "STS1": 8}
 """Step between evaluated frames, by movement. For learning, every tenth frame of the squats is
 used."""
@@ -55,7 +55,7 @@ def motion(data: Path, name: str, every: int | None = None) -> MotionTrial:
 
 
 def rms_mm(found: Refinement, trial: str) -> float:
-    return _MM * next(t.after.rms for t in found.trials if t.name == trial)
+    return MM_PER_M * next(t.after.rms for t in found.trials if t.name == trial)
 
 
 @cache
@@ -126,7 +126,7 @@ def beside_search(data: Path, every: int = 1) -> list[Result]:
     found = refine_markers(model, trials, settings, validation)
     ended = time.process_time()
     error, reference = rms_mm(joint, "walking1"), rms_mm(found, "walking1")
-    before = _MM * joint.trials[0].before.rms
+    before = MM_PER_M * joint.trials[0].before.rms
     return [
         Result("walking1 before", before, inf, unit="mm"),
         Result("walking1, simultaneous", error, reference + 0.1, unit="mm"),
@@ -158,7 +158,11 @@ def unseen(data: Path) -> list[Result]:
     before, after = found.variance_of_trials(trained=True)
     return [
         Result("STS1, not trained", rms_mm(found, "STS1"), 6.5, unit="mm"),
-        *(Result(t.name, _MM * t.after.rms, inf, unit="mm") for t in found.trials if t.trained),
+        *(
+            Result(t.name, MM_PER_M * t.after.rms, inf, unit="mm")
+            for t in found.trials
+            if t.trained
+        ),
         Result("variance of training trials before", 1e6 * before, inf, unit="mm²"),
         Result("variance of training trials after", 1e6 * after, 1e6 * before, unit="mm²"),
     ]
@@ -255,7 +259,7 @@ def truth(data: Path, count: int = 8) -> list[Result]:
     for draw in _draws(model, truly, _ANATOMICAL, count):
         found = draw.learned(draw.seen, 0.01)
         gone = np.linalg.norm((found.positions - model.positions)[draw.free], axis=-1)
-        off_mm.append(_MM * np.sqrt(np.mean(gone**2)))
+        off_mm.append(MM_PER_M * np.sqrt(np.mean(gone**2)))
         before, after = (_all_off(model, m, truly, draw.seen) for m in (draw.start, found))
         shares.append(100 * (1 - after / before))
         errors.append((before, after))

@@ -20,6 +20,7 @@ from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceOpened
 from jointfit_daemon.timing.alignment import FrameAligner
 from jointfit_daemon.timing.clock import DeviceClock
+from jointfit_daemon.units import NS_PER_S
 from jointfit_protocols.xcdi import XcdiIds
 from jointfit_simulators.body import SENSORS
 
@@ -31,8 +32,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chunk, Quaternion
     from jointfit_daemon.pipeline.events import Event
 
-NS = 1_000_000_000
-START_NS = 1_000 * NS
+START_NS = 1_000 * NS_PER_S
 SETTLE_S = 3.0
 """Time in which the clocks converge, s. It is not part of the measurement."""
 
@@ -62,8 +62,8 @@ def align_rows(quick: bool) -> list[Result]:
     The time is advanced after each sample, as in the core.
     """
     period_ns, seconds = 2_500_000, 2
-    n = seconds * NS // period_ns
-    orientations = walking("S1", NS / period_ns, seconds)
+    n = seconds * NS_PER_S // period_ns
+    orientations = walking("S1", NS_PER_S / period_ns, seconds)
 
     def work() -> Callable[[], object]:
         aligner = FrameAligner(dict.fromkeys(SENSORS, period_ns), 10_000_000)
@@ -127,7 +127,7 @@ def fusion_rows(quick: bool) -> list[Result]:
         ),
         per_item(
             "output: pose as JSON",
-            lambda: lambda: [encode_pose(state, NS, 2 * NS) for state in states],
+            lambda: lambda: [encode_pose(state, NS_PER_S, 2 * NS_PER_S) for state in states],
             items=n,
             goal_us=20,
             quick=quick,
@@ -141,7 +141,7 @@ def fusion_rows(quick: bool) -> list[Result]:
 @cache
 def events(rate_hz: float, seconds: float) -> list[Event]:
     """Return the chunks of four IMUs during a walk, one per sample, in order of arrival."""
-    period_ns = round(NS / rate_hz)
+    period_ns = round(NS_PER_S / rate_hz)
     chunks: list[tuple[Chunk, str]] = []
     for number, sensor in enumerate(SENSORS, 1):
         orientations = walking(sensor, rate_hz, seconds)

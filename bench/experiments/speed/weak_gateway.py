@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from heapq import merge
 from typing import TYPE_CHECKING
 
-from bench.experiments.speed.core import NS, START_NS, events, worn
+from bench.experiments.speed.core import START_NS, events, worn
 from bench.framework.measurement import speed_experiment, timed_result
 from bench.subjects.device_bytes import natnet_datagrams, natnet_opening
 from bench.subjects.simulated_wearer import bench_rig
@@ -21,6 +21,7 @@ from jointfit_daemon.model import Chunk, LimbState
 from jointfit_daemon.outputs.payloads import encode_pose
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceOpened
+from jointfit_daemon.units import NS_PER_S
 
 if TYPE_CHECKING:
     from bench.framework.experiment import Result
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
 SETTLE_S, ROUNDS, QUICK_ROUNDS = 3, 9, 2
 CAMERA_NS = 10_000_000
-UNIX_NS = 1_700_000_000 * NS
+UNIX_NS = 1_700_000_000 * NS_PER_S
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class _Gateway:
             stream = [*_opening(), *merge(stream, _camera_frames(seconds), key=_instant)]
         self._seconds: list[list[Event]] = [[] for _ in range(seconds + 1)]
         for event in stream:
-            self._seconds[min(seconds, (_instant(event) - START_NS) // NS)].append(event)
+            self._seconds[min(seconds, (_instant(event) - START_NS) // NS_PER_S)].append(event)
 
         rig = replace(bench_rig(setting.sensors_hz), output_rate_hz=setting.poses_hz)
         self._core = Core()

@@ -24,6 +24,7 @@ from jointfit_daemon.timing.lag import (
     estimate_lag_of_rates,
     rates_from_orientations,
 )
+from jointfit_daemon.units import NS_PER_MS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-MS = 1e6
 HALF_FRAME_MS = 1e3 / 240
 FAST, SLOW = "07_undisturbed_fast_rotation_B", "02_undisturbed_slow_rotation_B"
 MARGIN_S = 0.3
@@ -119,7 +119,7 @@ def windows(
         noise = rng.normal(scale=np.radians(noise_deg), size=(len(stamps), 3))
         optical = rotation.multiply(optical, rotation.exp(noise))
         optical[rng.random(len(stamps)) < lost] = np.nan
-        injected = round(rng.uniform(-50, 50) * MS)
+        injected = round(rng.uniform(-50, 50) * NS_PER_MS)
         near = np.abs(recording.t_ns - np.mean(stamps)) < 5e8 * length_s + 1e9 * MARGIN_S
         t_ns = recording.t_ns[near] + injected
         if quaternions is None:
@@ -128,8 +128,8 @@ def windows(
             imu = rates_from_orientations(t_ns, quaternions[near], 0)
         ref = rates_from_orientations(np.rint(stamps).astype(np.int64), optical, 0)
         estimate = estimate_lag_of_rates(imu, ref)
-        lag_ms = (estimate.lag_ns - injected) / MS
-        found.append(Window(lag_ms, estimate.sigma_ns / MS, estimate.refused is None))
+        lag_ms = (estimate.lag_ns - injected) / NS_PER_MS
+        found.append(Window(lag_ms, estimate.sigma_ns / NS_PER_MS, estimate.refused is None))
     return found
 
 
@@ -142,7 +142,9 @@ def excerpts(
         imu, rates_from_orientations(recording.t_ns, recording.optical, 0)
     )
     middle, off = constant
-    figures = [Result("whole minute", estimate.lag_ns / MS, middle + off, middle - off, "ms")]
+    figures = [
+        Result("whole minute", estimate.lag_ns / NS_PER_MS, middle + off, middle - off, "ms")
+    ]
     free = float("inf")
     for length_s in (2.0, 5.0, 10.0, 30.0):
         tries = [windows(recording, length_s, seed=seed) for seed in (6, 7, 8, 9)]
@@ -232,7 +234,7 @@ def made_up(
     q_imu = rotation.multiply(
         q_imu, rotation.exp(rng.normal(scale=spread / 3, size=(len(q_imu), 3)))
     )
-    stamps = np.rint(1e9 * (t_imu * (1.0 + drift)) + lag_ms * MS).astype(np.int64)
+    stamps = np.rint(1e9 * (t_imu * (1.0 + drift)) + lag_ms * NS_PER_MS).astype(np.int64)
     return LagTracks(stamps, q_imu, np.rint(1e9 * t_ref).astype(np.int64), q_ref)
 
 
@@ -263,7 +265,7 @@ def sigma(_: Path) -> list[Result]:
         for seed in range(32):
             found = estimate_between(made_up(seed, 10.0, 5.0, noise=noise), 0.4, 9.6, exact)
             if found.refused is None:
-                ratios.append((found.lag_ns / MS - 5.0) / (found.sigma_ns / MS))
+                ratios.append((found.lag_ns / NS_PER_MS - 5.0) / (found.sigma_ns / NS_PER_MS))
         label = f"noise of {noise:g}°, {len(ratios)} windows"
         spread = float(np.std(ratios))
         figures.append(Result(f"{label}: standard deviation", spread, 1.5, 0.5, "sd"))

@@ -14,12 +14,12 @@ from bench.framework.experiment import Experiment, Result
 from bench.framework.material import SIMULATED_SUBJECTS
 from bench.subjects.simulated_wearer import bench_rig, phases
 from jointfit_daemon.calibration.phases import fit_plate_alignment
+from jointfit_daemon.units import NS_PER_MS
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 SEEDS = tuple(range(1, 9))
-MS = 1e6
 FREE = float("inf")
 
 
@@ -32,8 +32,8 @@ def on_the_plate(_: Path) -> list[Result]:
             if found.lag_ns is None or not found.lag_sigma_ns:
                 refused += 1
                 continue
-            lags.append(found.lag_ns / MS)
-            sigmas.append(found.lag_sigma_ns / MS)
+            lags.append(found.lag_ns / NS_PER_MS)
+            sigmas.append(found.lag_sigma_ns / NS_PER_MS)
         phases.cache_clear()
     off, sigma = np.abs(lags), np.array(sigmas)
     return [

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.experiments.timing.lag import FAST, HALF_FRAME_MS, MS, Recording, whole, windows
+from bench.experiments.timing.lag import FAST, HALF_FRAME_MS, Recording, whole, windows
 from bench.framework.experiment import Experiment, Result
 from bench.framework.material import BOARD
 from bench.subjects.gyro_rates import rates_from_gyro
 from jointfit_daemon.timing.lag import Rates, estimate_lag_of_rates, rates_from_orientations
+from jointfit_daemon.units import NS_PER_MS
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -83,7 +84,7 @@ def stamp_sawtooth(recording: Recording) -> tuple[float, float]:
         right = basis.T @ pull
         fit = np.linalg.solve(basis.T @ (basis * weight[:, None]), right)
         best = max(best, (float(fit @ right), 1.0 / hz, float(np.hypot(fit[1], fit[2]))))
-    return best[1], 1e9 * np.pi * best[2] / MS
+    return best[1], 1e9 * np.pi * best[2] / NS_PER_MS
 
 
 def _smooth(omega: np.ndarray, rates: Rates) -> np.ndarray:

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 from bench.framework.experiment import Experiment, Result
 from bench.framework.material import LIVE_RIG
 from bench.rigs.loopback import delays_ns
+from jointfit_daemon.units import NS_PER_MS
 
 if TYPE_CHECKING:
     from bench.rigs.device_restarts import RestartRun
 
-_NS_PER_MS = 1e6
 _DATAGRAMS = 3000
 _REBOOTS = ("S1", "mocap", "S2", "S3", "mocap", "S4")
 
@@ -24,9 +24,9 @@ def _arrivals(_: Path) -> list[Result]:
     at_99 = int(0.99 * _DATAGRAMS)
     free = float("inf")
     return [
-        Result("kernel timestamp, median", stamped[_DATAGRAMS // 2] / _NS_PER_MS, free, unit="ms"),
-        Result("kernel timestamp, 99 %", stamped[at_99] / _NS_PER_MS, 0.1, unit="ms"),
-        Result("timestamp in Python, 99 %", read[at_99] / _NS_PER_MS, free, -free, unit="ms"),
+        Result("kernel timestamp, median", stamped[_DATAGRAMS // 2] / NS_PER_MS, free, unit="ms"),
+        Result("kernel timestamp, 99 %", stamped[at_99] / NS_PER_MS, 0.1, unit="ms"),
+        Result("timestamp in Python, 99 %", read[at_99] / NS_PER_MS, free, -free, unit="ms"),
     ]
 
 
@@ -46,11 +46,11 @@ async def _live() -> RestartRun:
 def _restarts(_: Path) -> list[Result]:
     found = asyncio.run(_live())
     frames = found.frame_errors_ns
-    late = sum(error > 0.5 * _NS_PER_MS for error in frames)
+    late = sum(error > 0.5 * NS_PER_MS for error in frames)
     figures = [
         Result(
             "largest error of a frame flagged synchronized",
-            max(frames) / _NS_PER_MS,
+            max(frames) / NS_PER_MS,
             0.5,
             unit="ms",
         ),
@@ -62,7 +62,7 @@ def _restarts(_: Path) -> list[Result]:
         Result("replay byte-identical", float(found.replayed), 1.0, minimum=1.0, unit=""),
     ]
     for source in ("S1", "S2", "S3", "S4", "mocap"):
-        worst = max(map(abs, found.errors_ns(source))) / _NS_PER_MS
+        worst = max(map(abs, found.errors_ns(source))) / NS_PER_MS
         figures.append(
             Result(
                 f"{source}: largest error of a sample flagged synchronized", worst, 0.5, unit="ms"

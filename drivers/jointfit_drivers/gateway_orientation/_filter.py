@@ -44,6 +44,7 @@ import numpy as np
 
 from jointfit_daemon.kinematics.rotation import rotate
 from jointfit_daemon.kinematics.rotation_scalar import multiply_one
+from jointfit_daemon.units import NS_PER_S
 from jointfit_drivers.gateway_orientation._start_estimator import (
     GRAVITY,
     StartEstimator,
@@ -87,7 +88,6 @@ MOST_DELAY_S = 0.05
 """Largest delay of the magnetometer, s."""
 NO_FIELD = (0.0, 0.0, 0.0)
 """Field of a reading without magnetic field; the filter ignores it."""
-_NS = 1e9
 
 
 class RawReading(NamedTuple):
@@ -174,7 +174,7 @@ class GatewayOrientation:
         self, rate_hz: float, *, magnetometer: bool, settle_s: float = LONGEST_SETTLE_S
     ) -> None:
         self._nominal_ns = 1e9 / rate_hz
-        self._settle_ns = round(settle_s * _NS)
+        self._settle_ns = round(settle_s * NS_PER_S)
         self._started_ns: int | None = None  # None: the filter has settled
         self._magnetic = magnetometer
         self._filter: Any = None
@@ -255,9 +255,9 @@ class GatewayOrientation:
         self._period_ns = period_ns
         self._started_ns = t_ns if self._settle_ns else None
         # Only the most recent readings are stored, however long the filter settles.
-        self._withheld = deque(maxlen=ceil(SETTLE_S * _NS / period_ns) + MOST_MISSING)
+        self._withheld = deque(maxlen=ceil(SETTLE_S * NS_PER_S / period_ns) + MOST_MISSING)
         self._estimator = None
-        self._filter = import_module("vqf").VQF(period_ns / _NS)  # ``vqf`` is an extra
+        self._filter = import_module("vqf").VQF(period_ns / NS_PER_S)  # ``vqf`` is an extra
         # The integrated orientations assume a constant bias until the start is estimated.
         self._filter.setMotionBiasEstEnabled(not (self._magnetic and self.settling))
 
@@ -290,7 +290,7 @@ class GatewayOrientation:
     def _settle(self, t_ns: int, waited_ns: int) -> None:
         """Begin the estimation of the start, and store when the filter has settled."""
         rest = self._filter.getRestDetected()
-        if not rest and waited_ns < min(self._settle_ns, SETTLE_S * _NS):
+        if not rest and waited_ns < min(self._settle_ns, SETTLE_S * NS_PER_S):
             return
         if self._withheld:
             self._estimate_start(t_ns, rest=rest)
@@ -322,14 +322,14 @@ class GatewayOrientation:
         if rest:
             bias = np.array(self._filter.state["restLastGyrLp"])
             bias_sd = radians(self._filter.params["biasSigmaRest"])
-        self._estimator = StartEstimator(parts, self._period_ns / _NS, assumed, bias, bias_sd)
+        self._estimator = StartEstimator(parts, self._period_ns / NS_PER_S, assumed, bias, bias_sd)
         self._converging_ns = t_ns
         self._continue_start(self._estimator, t_ns)
 
     def _continue_start(self, estimator: StartEstimator, t_ns: int) -> None:
         """Set the filter to the estimated bias; at the end, set it to all estimates."""
         known = estimator.bias_sd <= KNOWN_BIAS_SD
-        late = t_ns - self._converging_ns >= CONVERGE_S * _NS
+        late = t_ns - self._converging_ns >= CONVERGE_S * NS_PER_S
         if not (known or late or self._filter.getRestDetected()):
             self._filter.setBiasEstimate(estimator.bias, estimator.bias_sd)
             return

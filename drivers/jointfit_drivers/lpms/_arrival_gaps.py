@@ -11,6 +11,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from jointfit_daemon.units import NS_PER_S
+
 _SAMPLES = 10
 """Number of samples in a window."""
 _LOST = 0.75
@@ -21,7 +23,6 @@ _WRONG_RATE = 0.2
 """Relative difference between mean interval and period from which the rate counts as different."""
 _WINDOWS = 3
 """Number of consecutive windows that prove a different rate."""
-_NS = 1e9
 
 
 class ArrivalStep(NamedTuple):
@@ -46,7 +47,7 @@ class ArrivalGaps:
     """
 
     def __init__(self, rate_hz: float) -> None:
-        self._period_ns = _NS / rate_hz
+        self._period_ns = NS_PER_S / rate_hz
         self._due_ns: float | None = None
         self._base_ns: float | None = None
         self._least_ns = float("inf")
@@ -75,7 +76,7 @@ class ArrivalGaps:
         if self._wrong >= _WINDOWS and mean_ns > 0:
             self._period_ns, self._due_ns = mean_ns, float(t_ns)
             self._base_ns, self._wrong = 0.0, 0
-            return ArrivalStep(rate_hz=_NS / mean_ns)
+            return ArrivalStep(rate_hz=NS_PER_S / mean_ns)
 
         if base_ns is None:
             self._base_ns = least_ns

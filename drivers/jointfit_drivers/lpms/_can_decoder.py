@@ -14,6 +14,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import DeviceEvent, ImuSample
+from jointfit_daemon.units import NS_PER_S
 from jointfit_drivers.bus_events import BusEvents
 from jointfit_drivers.lpms._arrival_gaps import ArrivalGaps
 from jointfit_drivers.lpms._orientation import LpmsConvention, LpmsOrientation
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chunk, Decoded
     from jointfit_drivers.lpms._can_settings import LpmsCanSettings
 
-_NS = 1_000_000_000
 _TORN = 20
 """Number of consecutive frames with incomplete quaternions after which their order is reported."""
 
@@ -57,7 +57,7 @@ class LpmsCanDecoder:
             settings.channel_ids,
             settings.precision,
             settings.mapping,
-            longest_ns=round(_NS / settings.rate_hz / 2),
+            longest_ns=round(NS_PER_S / settings.rate_hz / 2),
         )
         self._floats = settings.precision == "float32"
         self._rate_hz = settings.rate_hz

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from typing_extensions import override
 
 from jointfit_daemon.model import DeviceEvent, ImuSample, TickClock
+from jointfit_daemon.units import NS_PER_S
 from jointfit_drivers.lpms._orientation import LpmsConvention, LpmsOrientation
 from jointfit_drivers.lpms._output_search import ArrivedPacket, OutputSearch
 from jointfit_drivers.lpms._tick_rate import TickRateCheck
@@ -40,7 +41,6 @@ if TYPE_CHECKING:
     from jointfit_drivers.lpms._settings import LpmsSettings
     from jointfit_protocols.lpms.measurement import LpmsMeasurement
 
-_NS = 1_000_000_000
 _SECONDS_CLOCK = TickClock(1_000, None)
 """Device time of firmware that sends seconds, which are converted to microseconds."""
 _MOST_SECONDS = 1e9
@@ -157,7 +157,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
                 *out,
                 self._refusals.refuse(message.size, "device time is not a number of seconds"),
             ]
-        device_ns = ticks * 1_000 if self._is_seconds else ticks * _NS // self._ticks_per_s
+        device_ns = ticks * 1_000 if self._is_seconds else ticks * NS_PER_S // self._ticks_per_s
         step = self._continuity.add(device_ns, arrival_ns)
         values = measurement.values[self._layout.places["quaternion"]]
         packet = _Packet(message, arrival_ns, ticks, measurement, values)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from jointfit_daemon.units import NS_PER_S
 from jointfit_protocols.lpms.measurement import TICK_MODULUS, seconds_of
 
 _SPAN_NS = 3_000_000_000
@@ -22,7 +23,6 @@ _MOST_RATIO = 4.0
 """Largest ratio of an unusual rate to the configured one that is reported. The stamps of a file of
 raw bytes are not arrivals: they are closer together."""
 _USUAL_HZ = (400, 500, 800, 1000)
-_NS = 1e9
 
 
 class TimeUnitFault(NamedTuple):
@@ -71,7 +71,7 @@ class TickRateCheck:
             return None
         self._since = (tick, arrival_ns)
 
-        elapsed_s = (arrival_ns - since_ns) / _NS
+        elapsed_s = (arrival_ns - since_ns) / NS_PER_S
         seconds = (seconds_of(tick) - seconds_of(first)) / elapsed_s
         ticks = (tick - first) % TICK_MODULUS / elapsed_s
         if abs(seconds - 1 if self._is_seconds else ticks / self._ticks_per_s - 1) <= _NEAR:

@@ -14,6 +14,7 @@ from math import isfinite, isnan
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, MocapFrame, TickClock
+from jointfit_daemon.units import NS_PER_S
 from jointfit_drivers.lsl_markers._channels import stream_layout
 from jointfit_drivers.motion_capture import (
     ABSENT,
@@ -37,16 +38,15 @@ if TYPE_CHECKING:
     from jointfit_drivers.motion_capture import ColumnBinding
     from jointfit_protocols.lsl import StreamDescription
 
-_NS = 1_000_000_000
 _CLOCK = TickClock(1, None)
 _LATEST_S = 9e9
 """Largest time stamp, s, whose value in nanoseconds fits into 64 bits."""
-_BACKWARDS_NS = _NS
+_BACKWARDS_NS = NS_PER_S
 """Decrease of the stamps from which it shows a restart of the sender, ns."""
 _GAP_PERIODS, _LEAST_GAP_NS = 5, 100_000_000
 """Steps of the stamps of a regular stream, in periods and in ns. If both are exceeded, samples were
 lost. Programs that stamp samples at transmission have a jitter of several periods."""
-_EARLY_NS, _LATE_NS = 500_000_000, 10 * _NS
+_EARLY_NS, _LATE_NS = 500_000_000, 10 * NS_PER_S
 """Largest times by which a stamp on the LSL clock may be later and earlier than its arrival, ns."""
 
 
@@ -170,7 +170,9 @@ class LslMarkersDecoder:
         trip = self._trip
         if self._on_lsl_clock is not None or trip is None or self._settings.time == "sender":
             return
-        host_ns = (trip.sent_ns + trip.received_ns) // 2 + stamp_ns - round(trip.remote_s * _NS)
+        host_ns = (
+            (trip.sent_ns + trip.received_ns) // 2 + stamp_ns - round(trip.remote_s * NS_PER_S)
+        )
         delay_ns = arrival_ns - host_ns
         self._on_lsl_clock = -_EARLY_NS <= delay_ns <= _LATE_NS
         if self._on_lsl_clock:
@@ -179,10 +181,10 @@ class LslMarkersDecoder:
         out.append(
             DeviceEvent(
                 "warning",
-                f"the time stamps differ by {delay_ns / _NS:.1f} s from the clock of LSL: the "
+                f"the time stamps differ by {delay_ns / NS_PER_S:.1f} s from the clock of LSL: the "
                 'program sends another time, and only arrivals are used; set time = "sender" in '
                 "[mocap]",
-                {"difference_s": delay_ns / _NS},
+                {"difference_s": delay_ns / NS_PER_S},
             )
         )
 
@@ -192,11 +194,11 @@ class LslMarkersDecoder:
             return
         step_ns, rate_hz = stamp_ns - self._last[0], self._description.rate_hz
         if step_ns < -_BACKWARDS_NS:
-            text = f"clock of the sender stepped by {step_ns / _NS:+.3f} s"
-            out.append(DeviceEvent("restart", text, {"step_s": step_ns / _NS}))
+            text = f"clock of the sender stepped by {step_ns / NS_PER_S:+.3f} s"
+            out.append(DeviceEvent("restart", text, {"step_s": step_ns / NS_PER_S}))
             self._on_lsl_clock = None
-        elif rate_hz and step_ns > max(_GAP_PERIODS * _NS / rate_hz, _LEAST_GAP_NS):
-            lost = round(step_ns * rate_hz / _NS) - 1
+        elif rate_hz and step_ns > max(_GAP_PERIODS * NS_PER_S / rate_hz, _LEAST_GAP_NS):
+            lost = round(step_ns * rate_hz / NS_PER_S) - 1
             out.append(DeviceEvent("gap", f"{lost} samples lost", {"lost": lost}))
 
     # --- samples ------------------------------------------------------------------------------
@@ -209,7 +211,7 @@ class LslMarkersDecoder:
             if not abs(stamp_s) < _LATEST_S:
                 self.suspicious += 1
                 continue
-            stamp_ns = round(stamp_s * _NS)
+            stamp_ns = round(stamp_s * NS_PER_S)
             self._check_step(stamp_ns, out)
             self._last = (stamp_ns, arrival_ns)
             self._check_clock(stamp_ns, arrival_ns, out)
@@ -271,4 +273,4 @@ class LslMarkersDecoder:
 
 
 def _echo(trip: RoundTrip) -> ClockEcho:
-    return ClockEcho(trip.sent_ns, trip.received_ns, round(trip.remote_s * _NS))
+    return ClockEcho(trip.sent_ns, trip.received_ns, round(trip.remote_s * NS_PER_S))

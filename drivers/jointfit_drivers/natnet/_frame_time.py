@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import DeviceEvent, TickClock
+from jointfit_daemon.units import NS_PER_S
 from jointfit_protocols.natnet import DECIDING, PrecisionTime, timecode_of
 
 if TYPE_CHECKING:
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from jointfit_drivers.natnet._settings import NatNetSettings
     from jointfit_protocols.natnet import FrameOfData
 
-_NS = 10**9
 _UNIX = TickClock(1, None, None, "unix")
 
 
@@ -30,7 +30,7 @@ class FrameTime:
 
     def __init__(self, settings: NatNetSettings) -> None:
         self._precise = None if settings.time == "server" else PrecisionTime()
-        self._ahead_ns = settings.tai_minus_utc_s * _NS if settings.time == "ptp" else 0
+        self._ahead_ns = settings.tai_minus_utc_s * NS_PER_S if settings.time == "ptp" else 0
         self._coded = False
 
     @property

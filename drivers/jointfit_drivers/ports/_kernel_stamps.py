@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from jointfit_daemon.units import NS_PER_S
 from jointfit_drivers.ports._wall_clock import WallClock
 from jointfit_protocols.can import frame_bits
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-_NS = 1_000_000_000
 
 
 class KernelStamps(WallClock):
@@ -29,7 +28,7 @@ class KernelStamps(WallClock):
 
     def __init__(self, bitrate: int, *clocks: Callable[[], int]) -> None:
         super().__init__(*clocks)
-        self._bit_ns = _NS / bitrate
+        self._bit_ns = NS_PER_S / bitrate
 
     def start_ns(self, unix_s: float, size: int, extended: bool) -> int:
         """Return the start of a frame of `size` bytes, ns, from its kernel stamp `unix_s`.
@@ -40,5 +39,5 @@ class KernelStamps(WallClock):
         """
         # The limit is the current time, not the time of the wake-up. Otherwise frames that arrive
         # while this process is delayed would be stamped too early.
-        end = self.monotonic(round(unix_s * _NS), self._monotonic_ns())
+        end = self.monotonic(round(unix_s * NS_PER_S), self._monotonic_ns())
         return end - round(frame_bits(size, extended) * self._bit_ns)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from jointfit_daemon.units import M_PER_MM
 from jointfit_drivers.motion_capture import (
     ABSENT,
     FARTHEST_M,
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from jointfit_drivers.qtm._binding import QtmBinding
     from jointfit_protocols.qtm import Component
 
-_MM = 1e-3
 _ROTATION = slice(3, 12)
 
 
@@ -78,7 +78,7 @@ class QtmPoseConverter:
             if places is None:
                 return None
             for place, item in zip(places, bodies.items, strict=True):
-                x, y, z = item[0] * _MM, item[1] * _MM, item[2] * _MM
+                x, y, z = item[0] * M_PER_MM, item[1] * M_PER_MM, item[2] * M_PER_MM
                 if not is_near(x, y, z):
                     continue
                 r = item[_ROTATION]  # column-major
@@ -100,7 +100,7 @@ class QtmPoseConverter:
         placed = np.full((len(columns), 3), np.nan)
         residuals = np.full(len(columns), np.nan)
         if items:
-            numbers = np.array(items, dtype=np.float64) * _MM
+            numbers = np.array(items, dtype=np.float64) * M_PER_MM
             numbers[~(np.abs(numbers[:, :3]) <= FARTHEST_M).all(axis=1)] = np.nan
             placed = numbers[columns, :3] @ self._rotation
             residuals = numbers[columns, 3]
@@ -120,7 +120,7 @@ class QtmPoseConverter:
         suspicious = 0
         for number, segments in enumerate(component.skeletons):
             for segment in segments:
-                x, y, z = segment.x * _MM, segment.y * _MM, segment.z * _MM
+                x, y, z = segment.x * M_PER_MM, segment.y * M_PER_MM, segment.z * M_PER_MM
                 if not is_near(x, y, z):
                     continue
                 q = unit_quaternion(segment.qw, segment.qx, segment.qy, segment.qz)

@@ -14,7 +14,8 @@ from math import isfinite, sqrt
 from statistics import median
 from typing import TYPE_CHECKING
 
-from jointfit_drivers.table_samples._units import GRAVITY, UNITS
+from jointfit_daemon.units import STANDARD_GRAVITY
+from jointfit_drivers.table_samples._units import UNITS
 from jointfit_protocols.table import SLOTS, FieldReader
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ def fitting_keys(
     str or None
         Text for rig.toml; None if no change of byte order, type and scale explains the data.
     """
-    target = 1.0 if quantity == "quaternion" else GRAVITY
+    target = 1.0 if quantity == "quaternion" else STANDARD_GRAVITY
     if fields is None:
         typical = _typical([_norm(counts) for _, counts in samples], quantity)
         return None if typical is None else _scale_key(quantity, typical, target)

@@ -15,7 +15,8 @@ from __future__ import annotations
 from math import sqrt
 from typing import TYPE_CHECKING
 
-from jointfit_drivers.table_samples._units import GRAVITY, UNITS
+from jointfit_daemon.units import STANDARD_GRAVITY
+from jointfit_drivers.table_samples._units import UNITS
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import Vector
@@ -49,7 +50,7 @@ class RateUnitCheck:
     def take(self, t_ns: int, rate: Vector, force: Vector) -> None:
         """Add a reading: rate in rad/s and specific force in m/s^2, both in sensor axes."""
         length = sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
-        if abs(length - GRAVITY) > _FREE * GRAVITY:
+        if abs(length - STANDARD_GRAVITY) > _FREE * STANDARD_GRAVITY:
             self._last = None
             return
         a = (force[0] / length, force[1] / length, force[2] / length)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import TickClock
+from jointfit_daemon.units import S_PER_US
 from jointfit_drivers.gateway_orientation import RawSamples
 from jointfit_drivers.table_samples._records import SampleForm
 from jointfit_drivers.table_samples._units import UNITS
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from jointfit_drivers.table_samples._field_settings import FieldSettings, TableImuSettings
     from jointfit_protocols.table import ByteOrder, Quantity
 
-_US = 1e-6
 _WRAPS = 1 << 32
 """Number of values of the Arduino functions micros() and millis()."""
 _WRAPPING = ("us", "ms")
@@ -260,7 +260,7 @@ def _clock(form: TableForm, *, is_text: bool) -> tuple[TickClock | None, float |
     place, part = form.fields[slot], form.parts[slot]
     if is_text or place.kind == "f":
         modulus = part.modulus or (_WRAPS if is_text and part.unit in _WRAPPING else None)
-        per_count = place.scale / _US
+        per_count = place.scale / S_PER_US
         wrap = None if modulus is None else round(modulus * per_count)
         return TickClock(1000, wrap), per_count
 

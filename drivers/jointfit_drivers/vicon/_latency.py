@@ -12,10 +12,11 @@ import statistics
 from collections import deque
 from typing import TYPE_CHECKING
 
+from jointfit_daemon.units import NS_PER_S
+
 if TYPE_CHECKING:
     from jointfit_protocols.vicon import LatencyInfo
 
-_NS = 10**9
 _LONGEST_S = 1.0
 """Longest plausible sum of the stages, and largest age of a ping that is used, s."""
 _SUMS = 101
@@ -55,7 +56,7 @@ class AnnouncedLatency:
         if latency is not None:
             total = sum(seconds for _, seconds in latency.stages)
             if 0 <= total <= _LONGEST_S:
-                self._sums_ns.append(round(total * _NS))
+                self._sums_ns.append(round(total * NS_PER_S))
         if self._frames % _EVERY == 0:
             median = statistics.median(self._sums_ns) if self._sums_ns else 0
             self.delay_ns = round(median + self._half_trip_ns)
@@ -63,5 +64,5 @@ class AnnouncedLatency:
 
     def add_ping(self, sent_ns: int, arrival_ns: int) -> None:
         """Add the answer to a ping that was sent at `sent_ns`."""
-        if 0 <= arrival_ns - sent_ns <= _LONGEST_S * _NS:
+        if 0 <= arrival_ns - sent_ns <= _LONGEST_S * NS_PER_S:
             self._round_trips_ns.append(arrival_ns - sent_ns)

@@ -11,6 +11,7 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.kinematics.rotation_scalar import exp_one, multiply_one, rotate_one
+from jointfit_daemon.units import M_PER_MM
 from jointfit_drivers.motion_capture import (
     ABSENT,
     NO_POSITION,
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 
     Pose = tuple[Vector, Quaternion]
 
-_MM = 1e-3
 _WIDEST = 2 * math.pi
 """Largest plausible component of a rotation vector, rad. Comparisons treat NaN as larger."""
 _DEEPEST = 200
@@ -70,7 +70,7 @@ class ViconPoseConverter:
             for recon in item.recons if isinstance(item, vicon.LabeledRecons) else ():
                 key = member_key(recon.subject, recon.marker)
                 unknown += key not in binding.known_markers
-                x, y, z = recon.x * _MM, recon.y * _MM, recon.z * _MM
+                x, y, z = recon.x * M_PER_MM, recon.y * M_PER_MM, recon.z * M_PER_MM
                 if is_near(x, y, z):
                     seen[key] = self._place(x, y, z)
 
@@ -102,7 +102,7 @@ def _global_poses(state: SceneState) -> tuple[dict[int, Pose], int]:
         if not isinstance(item, vicon.Segments):
             continue
         for segment in item.segments:
-            x, y, z = (value * _MM for value in segment.position)
+            x, y, z = (value * M_PER_MM for value in segment.position)
             q = matrix_quaternion(segment.rotation)
             if q is None:
                 suspicious += 1
@@ -122,7 +122,7 @@ def _chained_poses(
             continue
         local: dict[int, Pose] = {}
         for segment in item.segments:
-            x, y, z = segment.x * _MM, segment.y * _MM, segment.z * _MM
+            x, y, z = segment.x * M_PER_MM, segment.y * M_PER_MM, segment.z * M_PER_MM
             turn = segment.rx, segment.ry, segment.rz
             if is_near(x, y, z) and all(abs(angle) <= _WIDEST for angle in turn):
                 local[segment.segment] = (x, y, z), exp_one(turn)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from math import radians
 from typing import TYPE_CHECKING
 
+from jointfit_daemon.units import STANDARD_GRAVITY
 from jointfit_drivers.gateway_orientation import (
     RawReading,
     RawStamp,
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from jointfit_drivers.gateway_orientation import RawSamples
     from jointfit_protocols.ximu3 import XImu3Data
 
-STANDARD_GRAVITY = 9.80665
 """Unit of the specific force, m/s²."""
 _DEGREE = radians(1.0)
 _OLDEST_US = 1_000_000

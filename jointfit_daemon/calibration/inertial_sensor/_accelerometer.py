@@ -37,6 +37,7 @@ from jointfit_daemon.calibration.inertial_sensor._refusal import SensorCalibrati
 from jointfit_daemon.calibration.inertial_sensor._rest_blocks import RestBlocks
 from jointfit_daemon.calibration.inertial_sensor._step_progress import StepProgress
 from jointfit_daemon.calibration.inertial_sensor._turns import TurnCollector
+from jointfit_daemon.units import STANDARD_GRAVITY
 
 if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
@@ -45,7 +46,6 @@ if TYPE_CHECKING:
     )
     from jointfit_daemon.calibration.inertial_sensor._rest_blocks import SensorReading
 
-STANDARD_GRAVITY = 9.80665
 """Magnitude of gravity, m/s^2. An error of this value is common to all axes and does not change
 inclinations.
 """

@@ -35,6 +35,7 @@ from jointfit_daemon.kinematics.accepted_errors import (
 )
 from jointfit_daemon.kinematics.inverse_kinematics import IkOptions
 from jointfit_daemon.limb_model import RefinedChain, chain_fingerprint, vector
+from jointfit_daemon.units import MM_PER_M
 
 if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
@@ -53,7 +54,6 @@ FARTHEST_M = 0.06
 """Largest plausible position error of a marker in a model, m. In operation, a marker at this
 distance counts as misplaced.
 """
-_MM = 1e3
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ def refine_chain(
     began_s = control.elapsed_s()
 
     def show_progress(share: float, error: float) -> None:
-        text = f"refining the markers of the chain model: error {_MM * error:.1f} mm"
+        text = f"refining the markers of the chain model: error {MM_PER_M * error:.1f} mm"
         control.report(share, text)
 
     try:
@@ -141,8 +141,8 @@ def _outcome(wanted: ChainRefinement, found: Refinement, unseen: MotionTrial) ->
     refused = {model.markers[m].segment for m in np.flatnonzero(far)}
     notes = [
         f"chain model {model.name!r}: markers of {model.markers[m].segment} not refined: "
-        f"{model.markers[m].name} would move by {_MM * np.linalg.norm(shift[m]):.0f} mm; check its "
-        "label, and its place in the model"
+        f"{model.markers[m].name} would move by {MM_PER_M * np.linalg.norm(shift[m]):.0f} mm; "
+        "check its label, and its place in the model"
         for m in np.flatnonzero(far)
     ]
 
@@ -246,8 +246,9 @@ def _notes(wanted: ChainRefinement, found: Refinement, figures: ChainQuality) ->
         )
     if (after := figures.after) is not None and not after.accepted:
         notes.append(
-            f"{name}: marker errors of {_MM * after.rms_m:.0f} mm RMS, {_MM * after.maximum_m:.0f} "
-            f"mm at most, expected below {_MM * ACCEPTED_RMS_M:.0f} and "
-            f"{_MM * ACCEPTED_MAXIMUM_M:.0f} mm: check labels, scale and joints of the model"
+            f"{name}: marker errors of {MM_PER_M * after.rms_m:.0f} mm RMS, "
+            f"{MM_PER_M * after.maximum_m:.0f} mm at most, expected below "
+            f"{MM_PER_M * ACCEPTED_RMS_M:.0f} and {MM_PER_M * ACCEPTED_MAXIMUM_M:.0f} mm: check "
+            "labels, scale and joints of the model"
         )
     return notes

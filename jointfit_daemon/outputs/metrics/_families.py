@@ -24,6 +24,7 @@ from jointfit_daemon import __version__
 from jointfit_daemon.fusion.faults import SensorState
 from jointfit_daemon.outputs.metrics._frame_statistics import LATENCY_LIMITS_S
 from jointfit_daemon.pipeline.events import CalibrationPhase
+from jointfit_daemon.units import S_PER_NS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -34,9 +35,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.outputs.payloads import BridgeHealth
     from jointfit_daemon.pipeline.health import DeviceHealth
 
-_NS = 1e-9
 _CLOCK_STATES = ("settling", "direct", "echo", "passive", "arrival", "stale")
-_STARTED_S = time.time_ns() * _NS - time.process_time()
+_STARTED_S = time.time_ns() * S_PER_NS - time.process_time()
 """UNIX time at which this process started, s. It is not read from /proc/stat, because the systemd
 option ProcSubset hides this file."""
 _Device = dict[str, tuple[str, "Callable[[DeviceHealth], float | None]"]]
@@ -136,7 +136,7 @@ def _frames(health: BridgeHealth, frames: FrameStatistics) -> Iterator[Metric]:
         "jointfit_frame_latency_seconds",
         "Time from the arrival of the sample that completed a frame to its outputs.",
         buckets=list(zip(limits, accumulate(frames.counts), strict=True)),
-        sum_value=frames.sum_ns * _NS,
+        sum_value=frames.sum_ns * S_PER_NS,
     )
 
 
@@ -166,7 +166,7 @@ def _device_details(devices: Mapping[str, DeviceHealth]) -> Iterator[Metric]:
             for share, value_ns in (
                 ("0.5", delays.p50_ns), ("0.99", delays.p99_ns), ("1", delays.max_ns),
             ):  # fmt: skip
-                delay.add_metric([name, share], value_ns * _NS)
+                delay.add_metric([name, share], value_ns * S_PER_NS)
         clock.add_metric([name], {one: one == device.clock.state for one in _CLOCK_STATES})
         if device.sensor is not None:
             states = {one: one == device.sensor for one in get_args(SensorState)}
@@ -195,7 +195,7 @@ def _calibration(health: BridgeHealth, frames: FrameStatistics) -> Iterator[Metr
     )
     for name, found in health.core.lags.items():
         if found.used_ns is not None:
-            lag.add_metric([name], found.used_ns * _NS)
+            lag.add_metric([name], found.used_ns * S_PER_NS)
     yield lag
 
 
@@ -249,4 +249,4 @@ def _resident_bytes() -> int | None:
 
 
 def _seconds(value_ns: float | None) -> float | None:
-    return None if value_ns is None or value_ns == float("inf") else value_ns * _NS
+    return None if value_ns is None or value_ns == float("inf") else value_ns * S_PER_NS

@@ -11,13 +11,13 @@ from jointfit_daemon.calibration.guidance import most_urgent
 from jointfit_daemon.pipeline.calibration_session._stillness_gate import SILENT_NS, StillnessGate
 from jointfit_daemon.pipeline.calibration_session._trial_recorder import TrialRecorder
 from jointfit_daemon.pipeline.events import CalibrationPhase
+from jointfit_daemon.units import NS_PER_S
 
 if TYPE_CHECKING:
     from jointfit_daemon.calibration import CalibrationTrial
     from jointfit_daemon.calibration.guidance import MovementGuide, MovementStatus
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
 
-_NS = 1_000_000_000
 PROGRESS_NS = 200_000_000
 """Interval between progress reports, ns. Five reports per second suffice for a progress bar."""
 STATIC_TIMEOUT_S = 120.0
@@ -103,7 +103,7 @@ class PhaseRecording:
             text = self._gate.text(now_ns)
             return self._share(still_s), text, {"still_s": round(still_s, 2)}
 
-        elapsed_s = (now_ns - self._start_ns) / _NS
+        elapsed_s = (now_ns - self._start_ns) / NS_PER_S
         silent = [name for name, t in self._last_ns.items() if now_ns - t > SILENT_NS]
         done, text = self._share(elapsed_s), "keep turning the plate about several axes"
         data: dict[str, object] = {}
@@ -143,7 +143,7 @@ class PhaseRecording:
 
     def timed_out(self, now_ns: int) -> bool:
         """Return whether a static phase has waited too long for stillness."""
-        timeout_ns = round(STATIC_TIMEOUT_S * _NS)
+        timeout_ns = round(STATIC_TIMEOUT_S * NS_PER_S)
         return self._gate is not None and now_ns - self._start_ns > timeout_ns
 
     @property

@@ -9,13 +9,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.calibration.registration import StillnessMonitor
+from jointfit_daemon.units import NS_PER_S
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from jointfit_daemon.model import Quaternion
 
-_NS = 1_000_000_000
 SILENT_NS = 500_000_000
 """Time without data after which a sensor counts as silent, ns."""
 REPORTED_NS = 500_000_000
@@ -60,7 +60,7 @@ class StillnessGate:
         if self.silent(now_ns):
             self.still_since_ns = None
         since_ns = self.still_since_ns
-        return 0.0 if since_ns is None else max(0, now_ns - since_ns) / _NS
+        return 0.0 if since_ns is None else max(0, now_ns - since_ns) / NS_PER_S
 
     def silent(self, now_ns: int) -> list[str]:
         """Return the sensors that send no data."""

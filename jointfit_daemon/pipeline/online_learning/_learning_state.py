@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING
 from jointfit_daemon.name_lists import list_names
 from jointfit_daemon.pipeline.events import Notice, NoticeKind, NoticeLevel
 from jointfit_daemon.pipeline.health import LearningHealth, LearningState
+from jointfit_daemon.units import NS_PER_S
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-_NS = 1_000_000_000
-REPORT_NS = 60 * _NS
+REPORT_NS = 60 * NS_PER_S
 """Duration after which an obstacle is reported, ns. Most occlusions are shorter."""
-MOCAP_SILENT_NS = 2 * _NS
+MOCAP_SILENT_NS = 2 * NS_PER_S
 """Time without frames after which the mocap system counts as switched off, ns."""
 MAX_NAMES = 4
 """Largest number of markers that a text lists by name."""
@@ -67,7 +67,7 @@ class LearningMonitor:
         if self._obstacle is None or now_ns - self._usable_ns < REPORT_NS or not present:
             return []
         self._reported = True
-        stopped_s = (now_ns - self._usable_ns) // _NS
+        stopped_s = (now_ns - self._usable_ns) // NS_PER_S
         text = f"online learning stopped for {stopped_s} s: {self._obstacle}"
         data = {"reason": self._obstacle, "stopped_s": stopped_s}
         return [Notice(now_ns, NoticeKind.CALIBRATION, "online", text, NoticeLevel.WARNING, data)]

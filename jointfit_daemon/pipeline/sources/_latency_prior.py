@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
+from jointfit_daemon.units import NS_PER_MS
+
 if TYPE_CHECKING:
     from jointfit_daemon.config import Source
 
-_NS_PER_MS = 1e6
 CAN_MS = (0.1, 0.1)
 """Mean and standard deviation of the delay on a CAN bus, ms, equal to one CAN frame at 1 Mbit/s."""
 UART_MS = (0.2, 0.2)
@@ -52,4 +53,4 @@ def latency_prior(source: Source) -> LatencyPrior:
         port = str(getattr(settings, "port", "")).lower()
         usb = getattr(settings, "transport", None) == "usb"
         mean, sd = USB_MS if usb or any(name in port for name in _USB_NAMES) else UART_MS
-    return LatencyPrior(round(mean * _NS_PER_MS), round(sd * _NS_PER_MS))
+    return LatencyPrior(round(mean * NS_PER_MS), round(sd * NS_PER_MS))

@@ -17,6 +17,7 @@ from jointfit_daemon.pipeline.sources._latency_prior import latency_prior
 from jointfit_daemon.pipeline.sources._sync_lines import SyncLines
 from jointfit_daemon.sensor_calibration import exchanged_sensor
 from jointfit_daemon.timing.clock import DeviceClock, Edge
+from jointfit_daemon.units import NS_PER_S
 
 if TYPE_CHECKING:
     from jointfit_daemon.driver import Decoder
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chunk, Decoded, TickClock
     from jointfit_daemon.timing.clock import Stamp
 
-_NS = 1_000_000_000
 _MEASUREMENTS = (ImuSample, MocapFrame)
 WITHHELD = ("unpublished", "duplicates", "late")
 """Counters that a decoder may have for frames that it decoded but did not return."""
@@ -79,7 +79,7 @@ class SourceState:
         grid also continues the counts of the samples, and both must agree.
         """
         mean_ns, sd_ns = latency_prior(source)
-        period_ns = round(_NS / source.rate_hz)
+        period_ns = round(NS_PER_S / source.rate_hz)
         clock = DeviceClock(period_ns, latency_ns=mean_ns, latency_sd_ns=sd_ns)
 
         state = cls(source=source, clock=clock)

@@ -13,11 +13,11 @@ from math import sqrt
 from typing import TYPE_CHECKING, Protocol
 
 from jointfit_daemon.kinematics.rotation_scalar import difference_one, perturb_one
+from jointfit_daemon.units import S_PER_NS
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion, Vector
 
-_NS = 1e-9
 CURVATURE_SHARE = 0.5
 """Fraction of the measured curvature that an extrapolation uses (docs/timing.md)."""
 _CONTRADICTS = 0.25
@@ -63,12 +63,12 @@ def interpolate_orientation(
     t_ns : int
         Instant in ``[a.t_ns, b.t_ns]``.
     """
-    x, h = (t_ns - a.t_ns) * _NS, (b.t_ns - a.t_ns) * _NS
+    x, h = (t_ns - a.t_ns) * S_PER_NS, (b.t_ns - a.t_ns) * S_PER_NS
     turn = _turn_to(b, a)
     if a.rate is not None and b.rate is not None and _agree(a.rate, b.rate, turn, h):
         r = _hermite(a.rate, b.rate, turn, x, h)
     elif before is not None:
-        h0 = (a.t_ns - before.t_ns) * _NS
+        h0 = (a.t_ns - before.t_ns) * S_PER_NS
         m, n = x * (x + h0) / (h * (h0 + h)), x * (h - x) / (h0 * (h0 + h))
         r = _combine(m, turn, n, _turn_to(a, before))  # `before` is at the negative of this vector
     else:
@@ -104,7 +104,7 @@ def extrapolate_orientation(
     bend : float
         The factor beta, used if rates are not measured.
     """
-    x, h0 = (t_ns - a.t_ns) * _NS, (a.t_ns - before.t_ns) * _NS
+    x, h0 = (t_ns - a.t_ns) * S_PER_NS, (a.t_ns - before.t_ns) * S_PER_NS
     x_c = min(x, h0)
     turn = _turn_to(a, before)
     if a.rate is not None and before.rate is not None and _agree(before.rate, a.rate, turn, h0):
@@ -113,7 +113,7 @@ def extrapolate_orientation(
     else:
         r = _combine(x / h0, turn, 0.0, turn)
         if earlier is not None:
-            h1 = (before.t_ns - earlier.t_ns) * _NS
+            h1 = (before.t_ns - earlier.t_ns) * S_PER_NS
             first = difference_one(a.q, earlier.q)
             # In the tangent space of `a`, `earlier` is at `first`, `before` at -turn, and `a` at 0.
             weight = bend * (x_c * (x_c + h0) + (2.0 * x_c + h0) * (x - x_c)) / (h0 + h1)

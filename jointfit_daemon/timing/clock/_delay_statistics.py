@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from jointfit_daemon.units import NS_PER_S
+
 HALF_NS = 30_000_000_000
 """Length of one histogram, ns."""
 
@@ -19,7 +21,6 @@ _SUB_BITS = 3
 _SUBS = 1 << _SUB_BITS
 _BINS = (40 - _UNIT_BITS) * _SUBS
 _LINEAR = 2 * _SUBS
-_NS = 1e9
 
 
 class DelayPercentiles(NamedTuple):
@@ -72,7 +73,7 @@ class DelayStatistics:
         first = before.first_ns if before.count else now.first_ns
         if count <= 1 or now.last_ns <= first:
             return None
-        return (count - 1) * _NS / (now.last_ns - first)
+        return (count - 1) * NS_PER_S / (now.last_ns - first)
 
     @property
     def delays(self) -> DelayPercentiles | None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from jointfit_daemon.timing.clock._clock_events import clock_event, clock_restart_event
 from jointfit_daemon.timing.clock._counter_wrap import unwrap
+from jointfit_daemon.units import NS_PER_S
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import TickClock
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.clock._echo_fit import EchoFit
     from jointfit_daemon.timing.clock._minimum_delay import MinimumDelayFilter
 
-NS = 1_000_000_000
-"""Nanoseconds per second."""
 FALL_NS = 500_000_000
 """Decrease of device time that indicates a restart instead of a reordered sample, ns."""
 BACKWARD_LIMIT = 4
@@ -62,7 +61,7 @@ _LATE_LOG_CHANCE = -14.0
 """Logarithm of the probability of a run of late samples by chance, one in a million, at which the
 samples count as lost.
 """
-_SILENCE_NS = 2 * NS
+_SILENCE_NS = 2 * NS_PER_S
 """Silence after which samples without device time cannot be numbered, ns."""
 
 
@@ -119,7 +118,7 @@ class TickTime:
     def to_ns(self, ticks: int) -> int:
         """Return unwrapped ticks in ns, in integer arithmetic."""
         rate = self._clock.ticks_per_s
-        return ticks * self._clock.tick_ns if rate is None else ticks * NS // rate
+        return ticks * self._clock.tick_ns if rate is None else ticks * NS_PER_S // rate
 
     def echo_ns(self, ticks: int) -> int:
         """Return the device time of an echo, ns, on the turn nearest to the last sample."""
@@ -299,8 +298,8 @@ class ArrivalTime:
         """Return the event for a restart at this sample, `elapsed_ns` after the last sample."""
         if elapsed_ns > _SILENCE_NS:
             return clock_event(
-                f"no samples for {elapsed_ns / NS:.1f} s from a device without sample counter; "
-                "sample numbering restarted"
+                f"no samples for {elapsed_ns / NS_PER_S:.1f} s from a device without sample "
+                "counter; sample numbering restarted"
             )
         return clock_event(
             "sample delay is not a multiple of the period; sample numbering restarted"

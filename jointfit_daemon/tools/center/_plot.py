@@ -12,6 +12,7 @@ import numpy as np
 
 from jointfit_daemon.tools.center.trial import CHI2_95
 from jointfit_daemon.tools.plotting import new_figure
+from jointfit_daemon.units import MM_PER_M
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.tools.center.trial import ParentFrameMotion, WindowEstimate
 
-_MM = 1000.0
 _MOST_POINTS = 600
 """Largest number of plotted samples of a marker. It limits the size of vector graphics."""
 _END_ON = 0.1
@@ -44,7 +44,7 @@ def draw_center(
     step = max(1, len(points) // _MOST_POINTS)
     for axes, side in zip(figure.subplots(1, len(sides), squeeze=False)[0], sides, strict=True):
         for k, name in enumerate(markers):
-            x, y = _MM * points[::step, k, side[0]], _MM * points[::step, k, side[1]]
+            x, y = MM_PER_M * points[::step, k, side[0]], MM_PER_M * points[::step, k, side[1]]
             axes.plot(x, y, ".", markersize=2.5, label=name)
         for number, answer in enumerate(found):
             _center(axes, answer, side, labelled=number == 0)
@@ -64,7 +64,7 @@ def _center(axes: Any, answer: WindowEstimate, side: tuple[int, int], *, labelle
     if not np.isfinite(e.center).all():
         return
 
-    at = _MM * e.center[list(side)]
+    at = MM_PER_M * e.center[list(side)]
     refused = e.refused is not None
     label = ("centre, refused" if refused else "centre, 95 % ellipse") if labelled else None
     axes.plot(*at, "kx" if refused else "k+", markersize=9, label=label)
@@ -80,6 +80,6 @@ def _center(axes: Any, answer: WindowEstimate, side: tuple[int, int], *, labelle
     turn = np.linspace(0.0, 2.0 * np.pi, 73)
     rank = len(e.center) - len(e.unseen)
     scale = 1.0 if e.within95 is None or rank < 1 else e.within95 / CHI2_95[rank]
-    lengths = _MM * np.sqrt(scale * CHI2_95[2] * np.maximum(values, 0.0))
+    lengths = MM_PER_M * np.sqrt(scale * CHI2_95[2] * np.maximum(values, 0.0))
     outline = vectors @ (lengths[:, None] * np.stack((np.cos(turn), np.sin(turn))))
     axes.plot(at[0] + outline[0], at[1] + outline[1], "k-", linewidth=0.8)

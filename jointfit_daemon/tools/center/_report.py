@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jointfit_daemon.tools.text_output import align_columns
+from jointfit_daemon.units import MM_PER_M
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.files.mocap import MarkerTrial
     from jointfit_daemon.tools.center.trial import ParentFrameMotion, WindowEstimate
 
-_MM = 1000.0
 _FLAGS = {
     "orientation_inconsistent": "inertial angles disagree with the circle fit, which was used",
     "residuals_persist": "residuals are correlated over time: frames are not independent",
@@ -49,7 +49,7 @@ def head(
         f"trial     {len(data.t_s)} frames at {data.rate_hz:g} Hz,"
         f" {len(data.t_s) / data.rate_hz:.2f} s; {trial.up_axis} is up ({trial.up_said_by})",
         f"parent    {', '.join(parent)}: tracked in {100 * whole:.0f} % of the frames, rigid-fit"
-        f" residual {_MM * reduced.rms:.1f} mm RMS",
+        f" residual {MM_PER_M * reduced.rms:.1f} mm RMS",
         "markers   "
         + ", ".join(f"{m} ({100 * s:.0f} %)" for m, s in zip(markers, seen, strict=True)),
         "axes      " + _axes(parent, planar=reduced.basis.shape[1] == len("xy")),
@@ -138,7 +138,7 @@ def point(x: NDArray[np.float64]) -> str:
     """Return coordinates in mm, each with its axis."""
     if not np.isfinite(x).all():
         return "unknown"
-    return " ".join(f"{name} {_MM * value:.1f}" for name, value in zip("xyz", x, strict=False))
+    return " ".join(f"{name} {MM_PER_M * value:.1f}" for name, value in zip("xyz", x, strict=False))
 
 
 def _direction(u: NDArray[np.float64]) -> str:
@@ -153,7 +153,7 @@ def mm(metres: float) -> str:
     """Return a length in mm."""
     if not isfinite(metres):
         return "unknown"
-    size = _MM * metres
+    size = MM_PER_M * metres
     return f"{size:.1f}" if size >= 1.0 else f"{size:.2g}"
 
 

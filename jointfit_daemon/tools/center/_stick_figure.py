@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.tools.plotting import new_figure
+from jointfit_daemon.units import MM_PER_M
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.files.mocap import MarkerTrial
     from jointfit_daemon.tools.center.chain import ChainJoint
 
-_MM = 1000.0
 _POSTURES = 12
 """Number of drawn postures, distributed over the trial."""
 
@@ -52,15 +52,15 @@ def draw_stick_figure(
     figure = new_figure(5.6 * len(sides) + 1.4, 5.6)
     for axes, across in zip(figure.subplots(1, len(sides), squeeze=False)[0], sides, strict=True):
         for joint in joints:
-            track = _MM * joint.trajectory.positions
+            track = MM_PER_M * joint.trajectory.positions
             axes.plot(track[:, across], track[:, up], color="0.7", linewidth=0.8)
         for frame, color in zip(shown, colors, strict=True):
-            posture = _MM * line[frame]
+            posture = MM_PER_M * line[frame]
             axes.plot(posture[:, across], posture[:, up], "-", color=color, linewidth=1.4)
             axes.plot(posture[1:-1, across], posture[1:-1, up], "o", color=color, markersize=4)
-            seen = _MM * np.concatenate([points[frame] for points in in_file])
+            seen = MM_PER_M * np.concatenate([points[frame] for points in in_file])
             axes.plot(seen[:, across], seen[:, up], ".", color=color, markersize=2.5)
-        for joint, at in zip(joints, _MM * line[shown[0], 1:-1], strict=True):
+        for joint, at in zip(joints, MM_PER_M * line[shown[0], 1:-1], strict=True):
             if np.isfinite(at).all():
                 axes.annotate(joint.name, (at[across], at[up]), (4, 4), textcoords="offset points")
 

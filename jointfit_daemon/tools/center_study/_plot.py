@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jointfit_daemon.tools.plotting import new_figure
+from jointfit_daemon.units import MM_PER_M
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.center_of_rotation.study import PairMaps
 
-_MM = 1000.0
 _TOP_MM = {"α–σ": 50.0, "r–σ": 15.0, "r–α": 20.0}
 """Upper end of the colour scale of each row, mm."""
 _SOURCE = (
@@ -32,7 +32,7 @@ _OURS = (
     ("hyper", "hyper, all frames"),
     ("oriented", "orientation-aided, all frames"),
 )
-_AXES = {"α": ("α, deg", float(np.rad2deg(1.0))), "σ": ("σ, mm", _MM), "r": ("r, m", 1.0)}
+_AXES = {"α": ("α, deg", float(np.rad2deg(1.0))), "σ": ("σ, mm", MM_PER_M), "r": ("r, m", 1.0)}
 
 
 def draw_study(study: Sequence[PairMaps], folder: Path) -> list[Path]:
@@ -70,7 +70,7 @@ def _figure(study: Sequence[PairMaps], methods: Sequence[tuple[str, str]], title
             last = axes.pcolormesh(
                 pair.columns * x_scale,
                 pair.rows * y_scale,
-                np.ma.masked_invalid(_MM * pair.maps[key]),
+                np.ma.masked_invalid(MM_PER_M * pair.maps[key]),
                 vmin=0.0,
                 vmax=_TOP_MM[pair.name],
                 cmap="viridis",

@@ -17,6 +17,7 @@ from jointfit_daemon.center_of_rotation.study import (
     correlation,
 )
 from jointfit_daemon.tools.text_output import align_columns
+from jointfit_daemon.units import MM_PER_M
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -44,7 +45,6 @@ CAVEATS = (
     " bound, which holds for unbiased estimators.",
 )
 _SHOWN_DEG = (5, 10, 20, 30, 45, 60, 90, 120, 150, 175)
-_MM = 1000.0
 _METHODS = ("predicted", "three frames", "grid", "shifted grid", "bound", "hyper", "oriented")
 
 
@@ -55,12 +55,15 @@ def tables(setup: StudySetup, study: Sequence[PairMaps], more: StudyExtension) -
     for angle in (a for a in _SHOWN_DEG if a in degrees):
         at = degrees.index(angle)
         medians.append(
-            (f"{angle}°", *(f"{_MM * errors[at]:.3g}" for errors in more.median_errors.values()))
+            (
+                f"{angle}°",
+                *(f"{MM_PER_M * errors[at]:.3g}" for errors in more.median_errors.values()),
+            )
         )
 
     repetition: list[tuple[str, ...]] = [("α", "mean of centers", "center of mean positions")]
     for step, *errors_m in zip(STEPS_RAD, *more.repetition, strict=True):
-        repetition.append((f"{np.rad2deg(step):.0f}°", *(f"{_MM * m:.2g}" for m in errors_m)))
+        repetition.append((f"{np.rad2deg(step):.0f}°", *(f"{MM_PER_M * m:.2g}" for m in errors_m)))
 
     parts = [
         "Center of rotation from a marker on a circle: the numerical experiment of Akbarifar et al."
@@ -71,19 +74,19 @@ def tables(setup: StudySetup, study: Sequence[PairMaps], more: StudyExtension) -
         "The same with the grid shifted by half a step",
         _indent_table(_correlations(study, "shifted grid")),
         f"RMS error of the center, mm, at r = {setup.radii[-1]:g} m and"
-        f" σ = {_MM * setup.noise:g} mm; refused: share of runs that hyper refuses",
+        f" σ = {MM_PER_M * setup.noise:g} mm; refused: share of runs that hyper refuses",
         _indent_table(_errors(study)),
         f"Median error, mm, of two markers {np.rad2deg(APART_RAD):.0f}° apart that rotate by 2α, at"
-        f" r = {setup.radius:g} m and σ = {_MM * setup.noise:g} mm; bisectors: both markers, three"
-        " frames; Reuleaux and helical axis: both markers, first and last frame; the others: one"
-        f" marker, hyper with {setup.frames} frames",
+        f" r = {setup.radius:g} m and σ = {MM_PER_M * setup.noise:g} mm; bisectors: both markers,"
+        " three frames; Reuleaux and helical axis: both markers, first and last frame; the others:"
+        f" one marker, hyper with {setup.frames} frames",
         _indent_table(medians),
         f"Repetition of small angles: median error, mm, after averaging {setup.repeats} repetitions"
-        f" at r = {setup.radius:g} m and σ = {_MM * setup.noise:g} mm",
+        f" at r = {setup.radius:g} m and σ = {MM_PER_M * setup.noise:g} mm",
         _indent_table(repetition),
         "Effect of the radius: 95th percentile of the error over that at"
         f" r = {100 * setup.radii[-1]:g} cm, α = {np.rad2deg(setup.step):.0f}°,"
-        f" σ = {_MM * LARGE_NOISE_M:g} mm",
+        f" σ = {MM_PER_M * LARGE_NOISE_M:g} mm",
         _indent_table(
             [
                 ("r, cm", *(f"{100 * r:g}" for r in RADII_M)),
@@ -97,20 +100,20 @@ def tables(setup: StudySetup, study: Sequence[PairMaps], more: StudyExtension) -
 
 
 def _setup(setup: StudySetup) -> str:
-    r, s, a = setup.radii, _MM * setup.noises, np.rad2deg(setup.steps)
+    r, s, a = setup.radii, MM_PER_M * setup.noises, np.rad2deg(setup.steps)
     return "\n".join(
         (
             "  points    at angles 0, α, 2α about the center, distance r; independent normal noise"
             " σ on both coordinates",
             f"  r         {r[0]:g} to {r[-1]:g} m, {r.size} values; fixed {setup.radius:g} m",
             f"  σ         {s[0]:g} to {s[-1]:g} mm, {s.size} values; fixed"
-            f" {_MM * setup.noise:g} mm",
+            f" {MM_PER_M * setup.noise:g} mm",
             f"  α         {a[0]:.0f} to {a[-1]:.0f}°, {a.size} values; fixed"
             f" {np.rad2deg(setup.step):.0f}°",
             "  F         prediction: root of equation 15",
             f"  A         analytic: three frames, RMS of {setup.repeats} runs",
-            f"  G         grid: ±{100 * setup.box:g} cm in steps of {_MM * setup.node:g} mm, a node"
-            f" on the true center, RMS of the first {setup.grid_repeats} runs",
+            f"  G         grid: ±{100 * setup.box:g} cm in steps of {MM_PER_M * setup.node:g} mm, a"
+            f" node on the true center, RMS of the first {setup.grid_repeats} runs",
             f"  ours      {setup.frames} frames over the same arc, RMS of {setup.frames_repeats}"
             f" runs; orientation with {np.rad2deg(setup.orientation_noise):.0f}° of white error",
             f"  seed      {setup.seed}",
@@ -149,7 +152,7 @@ def _errors(study: Sequence[PairMaps]) -> list[tuple[str, ...]]:
         at = degrees.index(angle)
         errors_m = [float(pair.maps[key][-1, at]) for key in _METHODS]
         cells = (
-            "–" if np.isnan(m) else f"{_MM * m:.3g}" if m < 1.0 else "> 1000" for m in errors_m
+            "–" if np.isnan(m) else f"{MM_PER_M * m:.3g}" if m < 1.0 else "> 1000" for m in errors_m
         )
         rows.append((f"{angle}°", *cells, f"{100 * pair.refused[-1, at]:.0f} %"))
     return rows

@@ -13,6 +13,7 @@ from jointfit_daemon.kinematics.accepted_errors import (
 )
 from jointfit_daemon.tools.marker_limits import SOURCE, comparison
 from jointfit_daemon.tools.text_output import align_columns
+from jointfit_daemon.units import MM_PER_M
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.tools.ik._solution import TrialSolution
 
-_MM = 1000.0
 _WORST = 3
 """Number of markers that the output line ``worst`` lists."""
 _MARKER_HEAD = ("marker", "segment", "frames", "RMS, mm", "max, mm", "at, s")
@@ -36,13 +36,13 @@ def as_text(found: TrialSolution) -> str:
     for k in order.tolist():
         name = found.marker_names[k]
         count = int(_errors(found)[1][:, k].sum())
-        errors = (f"{_MM * rms[k]:.1f}", f"{_MM * most[k]:.1f}", f"{when[k]:.2f}")
+        errors = (f"{MM_PER_M * rms[k]:.1f}", f"{MM_PER_M * most[k]:.1f}", f"{when[k]:.2f}")
         markers.append((name, segments[name], str(count), *errors))
 
     chain = found.model
     count, solved = len(found.t_s), int(found.solved.sum())
     total, largest = _overall(found)
-    worst = ", ".join(f"{found.marker_names[k]} {_MM * rms[k]:.1f}" for k in order[:_WORST])
+    worst = ", ".join(f"{found.marker_names[k]} {MM_PER_M * rms[k]:.1f}" for k in order[:_WORST])
     lines = [
         f"model     {chain.name}: {len(chain.segments)} segments, {chain.nq} degrees of freedom,"
         f" {len(found.marker_names)} of {len(chain.markers)} markers tracked",
@@ -67,7 +67,7 @@ def as_text(found: TrialSolution) -> str:
 def _coordinates(found: TrialSolution) -> list[tuple[str, ...]]:
     rows = []
     for k, name in enumerate(found.names):
-        unit, scale = ("°", np.degrees(1.0)) if found.is_angle[k] else ("mm", _MM)
+        unit, scale = ("°", np.degrees(1.0)) if found.is_angle[k] else ("mm", MM_PER_M)
         values, sd = scale * found.values[:, k], scale * found.sd[:, k]
         numbers = (np.nanmin(values), np.nanmax(values), np.nanmedian(sd))
         rows.append((name, unit, *(f"{number:.1f}" for number in numbers)))

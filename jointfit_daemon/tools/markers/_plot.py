@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.tools.plotting import new_figure
+from jointfit_daemon.units import MM_PER_M
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_daemon.calibration.marker_refinement import Refinement
 
-_MM = 1000.0
 _BEFORE, _AFTER, _MOVED = "tab:gray", "tab:blue", "tab:orange"
 
 
@@ -25,9 +25,9 @@ def draw_refinement(path: Path, found: Refinement) -> None:
 
     # Residual before and after refinement, and displacement, by marker
     places = np.arange(len(found.markers))
-    before = [_MM * m.rms_before for m in found.markers]
-    after = [_MM * m.rms_after for m in found.markers]
-    moved = [_MM * m.distance for m in found.markers]
+    before = [MM_PER_M * m.rms_before for m in found.markers]
+    after = [MM_PER_M * m.rms_after for m in found.markers]
+    moved = [MM_PER_M * m.distance for m in found.markers]
     left.hlines(places, before, after, color=_BEFORE, linewidth=1.0)
     left.plot(before, places, "o", color=_BEFORE, label="residual before")
     left.plot(after, places, "o", color=_AFTER, label="residual after")
@@ -40,8 +40,8 @@ def draw_refinement(path: Path, found: Refinement) -> None:
 
     # Tracking error before and after refinement, by trial
     places = np.arange(len(found.trials))
-    right.barh(places - 0.2, [_MM * t.before.rms for t in found.trials], 0.4, color=_BEFORE)
-    right.barh(places + 0.2, [_MM * t.after.rms for t in found.trials], 0.4, color=_AFTER)
+    right.barh(places - 0.2, [MM_PER_M * t.before.rms for t in found.trials], 0.4, color=_BEFORE)
+    right.barh(places + 0.2, [MM_PER_M * t.after.rms for t in found.trials], 0.4, color=_AFTER)
     names = [f"{t.name}\n{'training' if t.trained else 'validation'}" for t in found.trials]
     right.set_yticks(places, names, fontsize=8)
     right.invert_yaxis()

@@ -12,6 +12,7 @@ from jointfit_daemon.kinematics.accepted_errors import (
 )
 from jointfit_daemon.tools.marker_limits import SOURCE, comparison
 from jointfit_daemon.tools.text_output import align_columns
+from jointfit_daemon.units import MM_PER_M
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
     )
     from jointfit_daemon.kinematics.chains import ChainModel
 
-_MM = 1000.0
-_MM2 = 1e6
 _MARKER_HEAD = ("marker", "segment", "moved, mm", "x, y, z", "locked", "residual, mm")
 _TRIAL_HEAD = ("trial", "", "frames", "RMS, mm", "", "variance over time, mm²", "joint change, °")
 
@@ -39,9 +38,9 @@ def as_text(chain: ChainModel, remarks: Sequence[str], found: Refinement) -> str
     moved = []
     for m in found.markers:
         held = "".join(axis for axis, is_held in zip("xyz", m.held, strict=True) if is_held)
-        by_axis = " ".join(f"{_MM * v:+.1f}" for v in m.moved)
+        by_axis = " ".join(f"{MM_PER_M * v:+.1f}" for v in m.moved)
         residual = f"{_mm(m.rms_before)} → {_mm(m.rms_after)}"
-        moved.append((m.name, m.segment, f"{_MM * m.distance:.1f}", by_axis, held, residual))
+        moved.append((m.name, m.segment, f"{MM_PER_M * m.distance:.1f}", by_axis, held, residual))
 
     lines = [
         f"model     {chain.name}: {len(chain.segments)} segments, {chain.nq} degrees of freedom,"
@@ -115,11 +114,11 @@ def _summary(found: Refinement) -> list[str]:
 
 
 def _mm(metres: float) -> str:
-    return f"{_MM * metres:.2f}" if isfinite(metres) else "–"
+    return f"{MM_PER_M * metres:.2f}" if isfinite(metres) else "–"
 
 
 def _mm2(square: float) -> str:
-    return f"{_MM2 * square:.2f}" if isfinite(square) else "–"
+    return f"{MM_PER_M**2 * square:.2f}" if isfinite(square) else "–"
 
 
 def _change(before: float, after: float) -> str:

@@ -14,6 +14,7 @@ from jointfit_daemon.model import LimbState
 from jointfit_daemon.pipeline.events import CalibrationStatus, ChunkArrived, Configured, Notice
 from jointfit_daemon.tools.replay._publication import Publication
 from jointfit_daemon.tools.stop_signals import cancel_on_signal
+from jointfit_daemon.units import NS_PER_S
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Output
     from jointfit_daemon.reprocessing import Changes
 
-_NS_PER_S = 1e9
 _YIELD_EVENTS = 200
 """Number of events after which other tasks can run, at the highest speed."""
 
@@ -153,7 +153,7 @@ class _Pace:
 
     def seconds(self, t_ns: int) -> float:
         """Return the time since the first event, s."""
-        return (t_ns - (self._first_ns or t_ns)) / _NS_PER_S
+        return (t_ns - (self._first_ns or t_ns)) / NS_PER_S
 
     @property
     def took_s(self) -> float:

@@ -3,7 +3,6 @@
 from jointfit_simulators.devices._bno085_device import Bno085Device, Bno085DeviceOptions
 from jointfit_simulators.devices._cameras import CameraFrames, Cameras
 from jointfit_simulators.devices._clocks import (
-    NS,
     ClockFault,
     PlannedSamples,
     SampleTiming,
@@ -52,7 +51,6 @@ from jointfit_simulators.devices._ximu3_device import XImu3Device, XImu3DeviceOp
 
 __all__ = [
     "LOOPBACK",
-    "NS",
     "WITH_QUATERNION",
     "Address",
     "Bno085Device",

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from typing_extensions import override
 
+from jointfit_daemon.units import STANDARD_GRAVITY
 from jointfit_protocols.bno085 import (
     ROTATION_REPORTS,
     HubReport,
@@ -43,7 +44,6 @@ if TYPE_CHECKING:
 
     from jointfit_simulators.imu_device import Quaternion, WireNoise
 
-_G = 9.80665
 _AGE = 12
 """Time between measurement and transmission, in units of 100 us."""
 _MICROTESLA = 50.0
@@ -226,7 +226,7 @@ class Bno085Device(SerialDevice):
     def _rvc(self, q: Quaternion) -> bytes:
         yaw, pitch, roll = (round(angle * 100) for angle in euler_deg(q, self._options.euler))
         force = self._inertial.value(Item.ACCELERATION) or (0.0, 0.0, 0.0)
-        x, y, z = (round(1000 * value / _G) for value in force)
+        x, y, z = (round(1000 * value / STANDARD_GRAVITY) for value in force)
         return encode_rvc(RvcFrame(self.counter & 0xFF, (yaw, pitch, roll), (x, y, z)))
 
     def _packet(self, channel: int, payload: bytes) -> bytes:

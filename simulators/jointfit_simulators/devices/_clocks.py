@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from jointfit_daemon.units import NS_PER_S
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from jointfit_simulators.settings import Knobs
-
-NS = 1_000_000_000
-"""Nanoseconds per second."""
 
 
 class SimulatedClock:
@@ -93,7 +92,7 @@ class SampleTiming:
     def __init__(self, knobs: Knobs, name: str, *, latency_ms: float, now_ns: int) -> None:
         self._random = knobs.random(f"clock {name}")
         skew = self._random.uniform(-1, 1) * knobs.clock_skew_ppm * 1e-6
-        up_ns = round(self._random.uniform(0.1, 1.0) * knobs.clock_offset_s * NS)
+        up_ns = round(self._random.uniform(0.1, 1.0) * knobs.clock_offset_s * NS_PER_S)
         self.clock = SimulatedClock(now_ns - up_ns, skew)
         self._jitter_ns = knobs.clock_jitter_us * 1e3
         self._latency_ns = latency_ms * 1e6
@@ -103,7 +102,7 @@ class SampleTiming:
 
     def set_fault(self, fault: ClockFault, now_ns: int) -> None:
         """Replace the random clock by the clock of `fault`; the run starts at `now_ns`."""
-        up_ns = now_ns - self.clock.boot_ns if fault.up_s is None else round(fault.up_s * NS)
+        up_ns = now_ns - self.clock.boot_ns if fault.up_s is None else round(fault.up_s * NS_PER_S)
         self.clock = SimulatedClock(now_ns - up_ns, fault.skew_ppm * 1e-6)
 
     def device_ns(self, host_ns: int) -> int:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+from jointfit_daemon.units import NS_PER_S
 from jointfit_protocols.can import CanFrame, frame_bits
 from jointfit_protocols.lpms import encode
 from jointfit_protocols.lpms.channels import (
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from jointfit_simulators.imu_device import Quaternion
     from jointfit_simulators.wires import CanWire
 
-_NS = 1_000_000_000
 WRAPPED = 1300
 """CAN identifier of the frames in which node 0 sends LP-BUS packets."""
 
@@ -92,7 +92,7 @@ class LpmsCanDevice(CanDevice):
         bitrate = self.wire.bitrate
         frames = self._channel_frames((1.0, 0.0, 0.0, 0.0))
         bits = sum(frame_bits(len(frame.data), extended=False) for frame in frames)
-        return bits * _NS // bitrate if bitrate else 0
+        return bits * NS_PER_S // bitrate if bitrate else 0
 
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
         """Send one sample now, as described in `ImuDevice.push`."""
@@ -128,7 +128,7 @@ class LpmsCanDevice(CanDevice):
         options = self._options
         if options.mode != "canopen" or not options.heartbeat_hz or not self.wire.is_open:
             return
-        if self._beat_ns is None or device_ns - self._beat_ns >= _NS / options.heartbeat_hz:
+        if self._beat_ns is None or device_ns - self._beat_ns >= NS_PER_S / options.heartbeat_hz:
             self._beat_ns = device_ns
             self.wire.send([encode_heartbeat(HEARTBEAT + options.node, OPERATIONAL)])
 
@@ -156,7 +156,7 @@ class LpmsCanDevice(CanDevice):
 
     def _wrapped_frames(self, device_ns: int, q: Quaternion) -> list[CanFrame]:
         """Return an LP-BUS data packet in frames of at most 8 bytes."""
-        tick = self._options.first_tick + device_ns * TABLES[1].tick_hz // _NS
+        tick = self._options.first_tick + device_ns * TABLES[1].tick_hz // NS_PER_S
         data = self._layout.encode(tick, self._native(q), floats=True)
         wire = encode(LpmsCommand.DATA, data, self._options.node)
         number = WRAPPED + self._options.node

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from typing_extensions import override
 
+from jointfit_daemon.units import NS_PER_S
 from jointfit_protocols.lpms import LpBusCodec, LpBusMessage, encode
 from jointfit_protocols.lpms.configuration import (
     TABLES,
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
     from jointfit_protocols.orientation import World
     from jointfit_simulators.imu_device import Quaternion, WireNoise
 
-_NS = 1_000_000_000
 _STATUS, _SLEEP, _GYRO_CALIBRATION = 0x05, 0x08, 0x16
 """Commands of generation 1 whose numbers are other commands in generation 3."""
 _FACTORY = {
@@ -241,7 +241,7 @@ class LpmsDevice(SerialDevice):
     def _tick(self, device_ns: int) -> int:
         hz = self._options.tick_hz or self._table.tick_hz
         # A tick is the number of a filter sample. Rounding removes the jitter of the clock.
-        ticks = self._options.first_tick + round((device_ns - self._epoch_ns) * hz / _NS)
+        ticks = self._options.first_tick + round((device_ns - self._epoch_ns) * hz / NS_PER_S)
         return tick_of(ticks / hz) if self._options.sends_seconds else ticks % TICK_MODULUS
 
     def _packet(self, device_ns: int, q: Quaternion) -> bytes:

@@ -14,6 +14,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
+from jointfit_daemon.units import NS_PER_S
 from jointfit_simulators.devices._natnet_frames import axes_from_z_up
 from jointfit_simulators.devices._natnet_options import same_clock
 
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 
 _UNITS = {"m": (1.0, "meters"), "cm": (100.0, "centimeters"), "mm": (1000.0, "millimeters")}
 _AXES, _TURN = "XYZ", "ABCD"
-_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +130,7 @@ class LslServer:
             )
 
         exposed_ns = exposure_host_ns or time.monotonic_ns()
-        stamp_s = self.options.device_ns(exposed_ns) / _NS + self._difference_s
+        stamp_s = self.options.device_ns(exposed_ns) / NS_PER_S + self._difference_s
         row = (
             [str(value) for value in values] if self.options.channel_format == "string" else values
         )

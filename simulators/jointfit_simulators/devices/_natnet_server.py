@@ -13,6 +13,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from jointfit_daemon.units import NS_PER_S
 from jointfit_protocols.natnet import (
     FRAME_BITSTREAM_CHANGED,
     FRAME_EDIT_MODE,
@@ -47,7 +48,6 @@ if TYPE_CHECKING:
     from jointfit_simulators.devices._natnet_frames import Bodies, Markers, RigidBodyAsset
     from jointfit_simulators.devices._natnet_port import Address
 
-_NS = 10**9
 _PATIENCE_NS = 50_000_000
 """Time after CONNECT at which frames begin without REQUEST_MODELDEF, ns."""
 _ANNOUNCED_FRAMES = 10
@@ -174,7 +174,7 @@ class NatNetServer:
         """
         frame = self._builder.frame(self._stamps(exposure_host_ns), markers, bodies)
         if self.options.precision_ns is not None:
-            precision = divmod(self.options.precision_ns(exposure_host_ns), _NS)
+            precision = divmod(self.options.precision_ns(exposure_host_ns), NS_PER_S)
             frame = frame._replace(precision=precision)
         self.number += 1
         self._model_changed = max(0, self._model_changed - 1)
@@ -184,7 +184,7 @@ class NatNetServer:
             return
         now_ns = time.monotonic_ns()
         for client in self.clients:
-            if now_ns - client.last_message_ns > self.options.keepalive_s * _NS:
+            if now_ns - client.last_message_ns > self.options.keepalive_s * NS_PER_S:
                 self._send(Bare(NatNetMessageId.DISCONNECTBYTIMEOUT), client.address)
                 self._disconnect(client)
             elif client.described or now_ns - client.connected_ns > _PATIENCE_NS:
@@ -193,7 +193,7 @@ class NatNetServer:
     # --- frames -------------------------------------------------------------------------------
 
     def _ticks(self, host_ns: int) -> int:
-        return self.options.device_ns(host_ns) * self.options.clock_hz // _NS
+        return self.options.device_ns(host_ns) * self.options.clock_hz // NS_PER_S
 
     def _stamps(self, exposure_ns: int) -> FrameStamps:
         options = self.options

@@ -13,6 +13,7 @@ import struct
 from typing import TYPE_CHECKING
 from xml.sax.saxutils import escape, quoteattr
 
+from jointfit_daemon.units import MM_PER_M
 from jointfit_protocols.qtm import (
     ComponentType,
     ItemsComponent,
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
         Vector,
     )
 
-_MM = 1000.0
 _RESIDUAL = 0.5
 """Residual of markers and bodies, mm."""
 _ABSENT: float = struct.unpack("<d", b"\xff" * 8)[0]
@@ -109,11 +109,12 @@ def _bodies_xml(
     nested = version >= _NESTED_FROM
     for body in bodies:
         points = body.positions or ((0.0, 0.0, 0.0),) * len(body.markers)
+        points_mm = [_numbers(point, 3) for point in points]
         text = f"<Name>{escape(body.name)}</Name>"
         if not nested:
             text += "<RGBColor>65280</RGBColor>"
-            for x, y, z in points:
-                text += f"<Point><X>{x * _MM}</X><Y>{y * _MM}</Y><Z>{z * _MM}</Z></Point>"
+            for x, y, z in points_mm:
+                text += f"<Point><X>{x}</X><Y>{y}</Y><Z>{z}</Z></Point>"
             described.append(f"<Body>{text}</Body>")
             continue
 
@@ -121,12 +122,9 @@ def _bodies_xml(
         if version >= _ENABLED_FROM:
             text += "<Enabled>true</Enabled>"
         text += '<Color R="0" G="255" B="0"/><Mesh><Name/></Mesh><Points>'
-        for number, (x, y, z) in enumerate(points, 1):
+        for number, (x, y, z) in enumerate(points_mm, 1):
             name = quoteattr(f"{body.name} - {number}")
-            text += (
-                f'<Point X="{x * _MM:f}" Y="{y * _MM:f}" Z="{z * _MM:f}" Virtual="0" '
-                f'PhysicalId="0" Name={name}/>'
-            )
+            text += f'<Point X="{x:f}" Y="{y:f}" Z="{z:f}" Virtual="0" PhysicalId="0" Name={name}/>'
         text += (
             f'</Points><Data_origin X="0" Y="0" Z="0" Relative_body="1">{origin}</Data_origin>'
             f'<Data_orientation R11="1" Relative_body="1">{origin}</Data_orientation>'
@@ -207,7 +205,7 @@ def _camera_code(ticks: int) -> QtmTimecode:
 def _numbers(position: Vector | None, width: int) -> tuple[float, ...]:
     if position is None:
         return (_ABSENT,) * width
-    return tuple(value * _MM for value in position)
+    return tuple(value * MM_PER_M for value in position)
 
 
 def _body(kind: ComponentType, pose: tuple[Vector, Quaternion] | None) -> tuple[float, ...]:

@@ -15,6 +15,7 @@ import struct
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from jointfit_daemon.units import MM_PER_M, NS_PER_S
 from jointfit_protocols import vicon
 from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.vicon import ObjectId
@@ -37,8 +38,6 @@ if TYPE_CHECKING:
     )
     from jointfit_simulators.devices._tcp_port import TcpClient
 
-_MM = 1000.0
-_NS = 10**9
 _RADIUS_MM = 7.0
 _HUGE = struct.pack("<I", 2**32 - 1)
 _OFFER = frozenset((
@@ -169,7 +168,7 @@ class ViconServer:
         if self._began_ns is None:
             self._began_ns = device_ns
         # The cameras count exposures on their own clock, from an arbitrary number.
-        hardware = round((device_ns - self._began_ns) * self.options.rate_hz / _NS)
+        hardware = round((device_ns - self._began_ns) * self.options.rate_hz / NS_PER_S)
         dynamic = self._dynamic(hardware, markers, bodies)
         self.number += 1
         for client in tuple(self._clients.values()):
@@ -235,7 +234,9 @@ class ViconServer:
                 if at is not None:
                     x, y, z = self._place(*at)
                     recons.append(
-                        vicon.LabeledRecon(subject, marker, _RADIUS_MM, x * _MM, y * _MM, z * _MM)
+                        vicon.LabeledRecon(
+                            subject, marker, _RADIUS_MM, x * MM_PER_M, y * MM_PER_M, z * MM_PER_M
+                        )
                     )
             pose = bodies.get(body.name)
             if pose is not None:
@@ -244,7 +245,7 @@ class ViconServer:
         return found
 
     def _segments(self, subject: int, pose: Pose) -> list[tuple[int, Object]]:
-        x, y, z = (value * _MM for value in self._place(*pose[0]))
+        x, y, z = (value * MM_PER_M for value in self._place(*pose[0]))
         q = self._turn(*pose[1])
         rotation = tuple(value for row in rotation_rows(q) for value in row)
         segment = (vicon.SegmentPose(1, (x, y, z), rotation),)

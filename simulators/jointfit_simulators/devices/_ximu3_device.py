@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Literal
 
 from typing_extensions import override
 
+from jointfit_daemon.units import STANDARD_GRAVITY
 from jointfit_protocols.orientation import World, native_of
 from jointfit_protocols.xbus.mtdata2 import Item
 from jointfit_protocols.ximu3 import (
@@ -41,7 +42,6 @@ if TYPE_CHECKING:
 
 NORM = 1.000121
 """Norm of the quaternions in the example log."""
-STANDARD_GRAVITY = 9.80665
 _WORLDS: tuple[World, ...] = ("NWU", "ENU", "NED")
 _FACTORY: dict[str, object] = {
     "device_name": "x-IMU3",

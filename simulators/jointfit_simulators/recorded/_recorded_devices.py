@@ -10,6 +10,7 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from jointfit_daemon.units import NS_PER_S
 from jointfit_protocols.can import CanFrame, unpack_frames
 from jointfit_protocols.natnet import (
     Bare,
@@ -36,8 +37,6 @@ if TYPE_CHECKING:
 
     from jointfit_simulators.devices import Address
     from jointfit_simulators.wires import CanWire
-
-_NS = 1_000_000_000
 
 
 class RecordedXbusDevice(XbusDevice):
@@ -213,7 +212,7 @@ class RecordedCameras:
         first_ns, ticks = self._ticks_at or (0, 0)
         now_ns = time.monotonic_ns()
         since_ns = now_ns - (self._began_ns if self._began_ns is not None else now_ns) - first_ns
-        return max(0, ticks + since_ns * (self._info.clock_hz or 0) // _NS)
+        return max(0, ticks + since_ns * (self._info.clock_hz or 0) // NS_PER_S)
 
     def _handle(self, data: bytes, address: Address) -> None:
         match decode(data, self._info.bitstream):

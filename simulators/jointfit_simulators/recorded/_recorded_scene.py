@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from jointfit_daemon.units import NS_PER_S
 from jointfit_simulators.recorded._recorded_devices import (
     RecordedCameras,
     RecordedCanSource,
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 
     RecordedDevice = RecordedXbusDevice | RecordedCanSource | RecordedCameras
 
-_NS = 1_000_000_000
 _POLL_S = 0.01
 _LEAD_S = 0.2
 """Time between the connection of the last device and the first chunk, s."""
@@ -127,7 +127,7 @@ class RecordedScene:
         active = {name: device for name, device in self._devices.items() if device.chunks}
         while not all(device.ready for device in active.values()):  # noqa: ASYNC110 - several hosts
             await asyncio.sleep(_POLL_S)
-        begin_ns = time.monotonic_ns() + round(_LEAD_S * _NS)
+        begin_ns = time.monotonic_ns() + round(_LEAD_S * NS_PER_S)
         if self._cameras is not None:
             self._cameras.begin(begin_ns)
 
@@ -135,12 +135,12 @@ class RecordedScene:
             (t_ns, name, data) for name, device in active.items() for t_ns, data in device.chunks
         )
         first_ns = order[0][0]  # answers of the handshake are earlier
-        report({"playing": round((order[-1][0] - first_ns) / _NS, 3)})
+        report({"playing": round((order[-1][0] - first_ns) / NS_PER_S, 3)})
         for t_ns, name, data in order:
             due_ns = begin_ns + t_ns - first_ns
             ahead_ns = due_ns - time.monotonic_ns()
             if ahead_ns > 0:
-                await asyncio.sleep(ahead_ns / _NS)
+                await asyncio.sleep(ahead_ns / NS_PER_S)
             active[name].send(data)
         await wait_until_read(self._links)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING
 
+from jointfit_daemon.units import NS_PER_S
 from jointfit_protocols import xbus
 from jointfit_protocols.natnet import ServerInfo
 from jointfit_protocols.natnet import encode as encode_natnet
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
 
 EPOCH_NS = 1_767_225_600 * 10**9
 """UNIX time of the first sample: 2026-01-01T00:00:00Z, ns."""
-_NS = 10**9
 _BITSTREAM = (3, 1)
 _CLOCK_HZ = 10_000_000
 _DATA_PORT, _COMMAND_PORT = 1511, 1510
@@ -100,11 +100,11 @@ def natnet_pcap(
         (0, encode_natnet(model_definition(bodies, _BITSTREAM), _BITSTREAM)),
     ]
     for number, (exposure_ns, markers, poses) in enumerate(frames):
-        ticks = _CLOCK_HZ + exposure_ns * _CLOCK_HZ // _NS  # 0 means unknown
+        ticks = _CLOCK_HZ + exposure_ns * _CLOCK_HZ // NS_PER_S  # 0 means unknown
         received, transmitted = ticks + _CLOCK_HZ // 200, ticks + _CLOCK_HZ // 150
         stamps = FrameStamps(number, number / rate_hz, ticks, received, transmitted, 0)
         frame = builder.frame(stamps, markers, poses)
-        datagrams.append((exposure_ns + _NS // 100, encode_natnet(frame, _BITSTREAM)))
+        datagrams.append((exposure_ns + NS_PER_S // 100, encode_natnet(frame, _BITSTREAM)))
     return _pcap(datagrams)
 
 
@@ -114,6 +114,6 @@ def _pcap(datagrams: Iterable[tuple[int, bytes]]) -> bytes:
         udp = struct.pack(">HHHH", _COMMAND_PORT, _DATA_PORT, 8 + len(payload), 0) + payload
         ip = struct.pack(">BBHHHBBH", 0x45, 0, 20 + len(udp), 0, 0, 64, _UDP, 0)
         packet = ip + _LOOPBACK + _LOOPBACK + udp
-        seconds, nanoseconds = divmod(EPOCH_NS + t_ns, _NS)
+        seconds, nanoseconds = divmod(EPOCH_NS + t_ns, NS_PER_S)
         parts += [struct.pack("<IIII", seconds, nanoseconds, len(packet), len(packet)), packet]
     return b"".join(parts)

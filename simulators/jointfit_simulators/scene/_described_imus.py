@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from jointfit_daemon.units import S_PER_US
 from jointfit_protocols.table import (
     SLOTS,
     CanTable,
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
 
 _COUNTS = 32767
 """Number of counts for 1 in quaternions of 16-bit integers."""
-_US = 1e-6
 (_TIME,), (_COUNTER,) = SLOTS["time"], SLOTS["counter"]
 
 
@@ -43,7 +43,7 @@ def binary_frames(port: Path, rate_hz: float, noise: WireNoise) -> tuple[TableDe
     }
     fields |= {
         _COUNTER: TableField(2, "u", 16, "big"),
-        _TIME: TableField(4, "u", 32, "big", scale=_US),
+        _TIME: TableField(4, "u", 32, "big", scale=S_PER_US),
     }
     checksum = Checksum("crc16", 2, "big", init=0xFFFF)
     wire = FrameFormat(b"\xaa\x55", fields, 18, checksum=checksum)
@@ -67,7 +67,7 @@ def text_lines(port: Path, rate_hz: float, noise: WireNoise) -> tuple[TableDevic
     """Return a device that sends text lines like an Arduino sketch, and its keys in rig.toml."""
     columns = {0: 5, 1: 2, 2: 3, 3: 4, _TIME: 0, _COUNTER: 1}
     fields = {slot: TableField(column, "f", 64) for slot, column in columns.items()}
-    fields[_TIME] = TableField(0, "u", 32, scale=_US)
+    fields[_TIME] = TableField(0, "u", 32, scale=S_PER_US)
     fields[_COUNTER] = TableField(1, "u", 32)
     wire = LineFormat(columns, prefix=b"$Q,", width=6, checksum=Checksum("xor8", 1, "big"))
     greeting = b"\r\nBNO085 ready\r\n"
@@ -86,7 +86,7 @@ def text_lines(port: Path, rate_hz: float, noise: WireNoise) -> tuple[TableDevic
 def time_and_integers(bus: CanWire, first_id: int, rate_hz: float) -> tuple[TableDevice, list[str]]:
     """Return a device that sends like an SBG Ellipse, and its keys in rig.toml."""
     fields = {slot: TableField(2 * slot, "i", 16, scale=1 / _COUNTS, frame=1) for slot in range(4)}
-    fields[_TIME] = TableField(0, "u", 32, scale=_US)
+    fields[_TIME] = TableField(0, "u", 32, scale=S_PER_US)
     table = CanTable(((first_id, False), (first_id + 1, False)), fields)
     options = TableDeviceOptions(fields, rate_hz, world="NED")
     keys = [

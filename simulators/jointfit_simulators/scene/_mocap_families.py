@@ -9,8 +9,8 @@ import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
+from jointfit_daemon.units import NS_PER_S
 from jointfit_simulators.devices import (
-    NS,
     LslServer,
     LslServerOptions,
     NatNetServer,
@@ -120,7 +120,7 @@ def _natnet(place: CameraPlace) -> tuple[NatNetServer, list[str]]:
     )
     if place.ptp:
         # PTP uses the time scale TAI. Its offset from the host clock is measured once.
-        offset_ns = time.time_ns() - time.monotonic_ns() + _TAI_MINUS_UTC_S * NS
+        offset_ns = time.time_ns() - time.monotonic_ns() + _TAI_MINUS_UTC_S * NS_PER_S
         options = replace(
             options, bitstream=(4, 1), precision_ns=lambda host_ns: host_ns + offset_ns
         )

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from jointfit_simulators.devices import NS, Pose, Vector
+from jointfit_daemon.units import NS_PER_S
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from jointfit_simulators.body import Observation
-    from jointfit_simulators.devices import Bodies, Cameras, Markers, SampleTiming
+    from jointfit_simulators.devices import Bodies, Cameras, Markers, Pose, SampleTiming, Vector
     from jointfit_simulators.scene._mocap_families import MocapServer
     from jointfit_simulators.scene._streams import SampleCallback
     from jointfit_simulators.settings import Knobs
@@ -48,7 +48,7 @@ class OpticalStream:
         """Callback for every sent frame, with the id ``mocap``."""
         self._server = server
         self._timing = timing
-        self._period_ns = NS / knobs.mocap_hz
+        self._period_ns = NS_PER_S / knobs.mocap_hz
         self._planned: deque[tuple[int, Markers, Bodies]] = deque()
         self.running = server is not None
         """Whether frames are sent. The cameras expose frames in any case."""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from jointfit_simulators.devices import NS
+from jointfit_daemon.units import NS_PER_S
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -28,15 +28,15 @@ if TYPE_CHECKING:
     from jointfit_simulators.scene._streams import ImuStream, SampleCallback
     from jointfit_simulators.scene._truth_log import TruthLog
 
-BLOCK_NS = NS // 5
+BLOCK_NS = NS_PER_S // 5
 """Duration of a planned block, ns."""
-AHEAD_NS = NS // 10
+AHEAD_NS = NS_PER_S // 10
 """Remaining time of a block at which the next block is planned, ns."""
-SKIP_NS = 2 * NS
+SKIP_NS = 2 * NS_PER_S
 """Duration of an interruption above which the missed time is skipped, ns."""
-TRUTH_NS = NS // 100
+TRUTH_NS = NS_PER_S // 100
 """Time between two samples of the ground truth, ns."""
-_FLUSH_NS = NS // 10
+_FLUSH_NS = NS_PER_S // 10
 """Time between two writes to the log of the ground truth, ns."""
 
 
@@ -96,11 +96,11 @@ class ScenePlayer:
 
     def motion(self) -> str:
         """Return the name of the current motion."""
-        return self._subject.motion_at((time.monotonic_ns() - self._origin_ns) / NS)
+        return self._subject.motion_at((time.monotonic_ns() - self._origin_ns) / NS_PER_S)
 
     def play(self, name: str) -> None:
         """Start a motion at the next block; raise UnknownMotionError for an unknown name."""
-        self._subject.play(name, (self._planned_ns - self._origin_ns) / NS)
+        self._subject.play(name, (self._planned_ns - self._origin_ns) / NS_PER_S)
 
     async def run(self) -> None:
         """Send the samples of all streams until cancelled."""
@@ -123,7 +123,7 @@ class ScenePlayer:
             wake_ns = self._planned_ns - AHEAD_NS
             if self._due:
                 wake_ns = min(wake_ns, self._due[0][0])
-            await asyncio.sleep(max(0.0, (wake_ns - time.monotonic_ns()) / NS))
+            await asyncio.sleep(max(0.0, (wake_ns - time.monotonic_ns()) / NS_PER_S))
 
     def finish(self) -> None:
         """Stop sending, and write the ground truth up to the current time."""
@@ -164,7 +164,7 @@ class ScenePlayer:
         motions = [self._subject.motion_at(t) for t in truth_s.tolist()]
         self._truth.add(truth_ns, motions, observation.truth, self._optical.cameras.world)
         self._planned_ns = end_ns
-        self._subject.discard_before((begin_ns - self._origin_ns) / NS)
+        self._subject.discard_before((begin_ns - self._origin_ns) / NS_PER_S)
 
     def _seconds(self, t_ns: NDArray[np.int64]) -> Array:
-        return (t_ns - self._origin_ns) / NS
+        return (t_ns - self._origin_ns) / NS_PER_S

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from jointfit_daemon.units import NS_PER_S
 from jointfit_simulators.body import (
     SimulatedSubject,
     UnknownMotionError,
@@ -18,7 +19,7 @@ from jointfit_simulators.body import (
     model_toml,
     to_wxyz,
 )
-from jointfit_simulators.devices import NS, Cameras, SampleTiming
+from jointfit_simulators.devices import Cameras, SampleTiming
 from jointfit_simulators.scene._hardware import WIRES, create_hardware
 from jointfit_simulators.scene._imu_families import BUS, IMU_FAMILIES
 from jointfit_simulators.scene._mocap_families import MOCAP_FAMILIES, CameraPlace
@@ -230,8 +231,8 @@ class Scene:
     async def _follow_script(self, report: Callable[[dict[str, object]], None]) -> None:
         """Run the scheduled commands."""
         for at_s, line in sorted(self._options.script):
-            due_ns = self._origin_ns + round(at_s * NS)
-            await asyncio.sleep(max(0.0, (due_ns - time.monotonic_ns()) / NS))
+            due_ns = self._origin_ns + round(at_s * NS_PER_S)
+            await asyncio.sleep(max(0.0, (due_ns - time.monotonic_ns()) / NS_PER_S))
             try:
                 self.command(line)
             except InvalidCommandError as error:

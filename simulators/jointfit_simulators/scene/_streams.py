@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 
-from jointfit_simulators.devices import NS, OrientationSensor, SampleTiming, SensorFaults
+from jointfit_daemon.units import NS_PER_S
+from jointfit_simulators.devices import OrientationSensor, SampleTiming, SensorFaults
 from jointfit_simulators.imu_device import ImuDevice
 
 if TYPE_CHECKING:
@@ -119,7 +120,7 @@ class ImuStream:
     def plan(self, begin_ns: int, end_ns: int) -> NDArray[np.int64]:
         """Plan the samples of a block; return their true host times, ns."""
         rate_hz = self.device.rate_hz or self._default_hz
-        self._block = self.timing.samples(begin_ns, end_ns, NS / rate_hz)
+        self._block = self.timing.samples(begin_ns, end_ns, NS_PER_S / rate_hz)
         return self._block.host_ns
 
     def fill(self, t_s: Array, q_base_sensor: Array) -> list[int]:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import can
 
+from jointfit_daemon.units import NS_PER_MS
 from jointfit_protocols.can.slcan import (
     BITRATES,
     DONE,
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     from jointfit_protocols.can import CanFrame
     from jointfit_simulators.imu_device import WireNoise
 
-_NS_PER_MS = 1_000_000
 _ANSWERS = {"V": b"V1013\r", "v": b"v0100\r", "N": b"NA123\r", "F": b"F00\r", "": DONE}
 """Answers to queries of version, serial number and status flags, and to an empty line."""
 
@@ -98,7 +98,7 @@ class SlcanAdapter:
         """Send all `frames` to the host or none of them."""
         if not self.is_open or self._bus_bitrate not in {None, self.bitrate}:
             return False
-        stamp = time.monotonic_ns() // _NS_PER_MS if self._stamping else None
+        stamp = time.monotonic_ns() // NS_PER_MS if self._stamping else None
         return self._line.write(self._noise(b"".join(encode_frame(f, stamp) for f in frames)))
 
     async def run(self) -> None:

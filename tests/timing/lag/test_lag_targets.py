@@ -9,6 +9,7 @@ import numpy as np
 from bench.experiments.timing import lag
 from bench.subjects.gyro_rates import rates_from_gyro
 from jointfit_daemon.timing.lag import LagSettings, estimate_lag_of_rates, rates_from_orientations
+from jointfit_daemon.units import NS_PER_MS
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -33,7 +34,7 @@ def errors_of_short_passages(data: Path, settings: LagSettings) -> list[float]:
     rng = np.random.default_rng(1)
     gyro = body.w + rng.normal(scale=np.radians(1.0), size=body.w.shape)
     sawtooth_ms = TICK_MS * (body.t_s / PERIOD_S % 1.0 - 0.5)
-    t_ns = np.rint(1e9 * body.t_s + lag.MS * sawtooth_ms).astype(np.int64)
+    t_ns = np.rint(1e9 * body.t_s + NS_PER_MS * sawtooth_ms).astype(np.int64)
     found = []
     for start_s in np.linspace(4.0, 58.0, 32):
         near = np.abs(body.t_s - start_s - 0.5) < 0.8
@@ -62,4 +63,4 @@ def test_even_motion_averages_the_stamp_error(shared_data: Path) -> None:
     part = (recording.t_ns > 10e9) & (recording.t_ns < 20e9)
     imu = rates_from_gyro(recording.t_ns[part], recording.gyro[part], 0)
     ref = rates_from_orientations(recording.t_ns[part], recording.optical[part], 0)
-    assert estimate_lag_of_rates(imu, ref).sigma_ns < 0.06 * lag.MS
+    assert estimate_lag_of_rates(imu, ref).sigma_ns < 0.06 * NS_PER_MS
