@@ -11,7 +11,6 @@ The margin m prevents the skew of a slow device clock from accumulating as delay
 opened, the delay is unknown until messages have arrived at the device's own rate.
 
 Invariant: the result depends only on the steps fed, in any unit of time. The module reads no clock.
-Invariant: a function of the steps fed, without a clock of its own; any unit of time.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ from __future__ import annotations
 _SKEW = 0.001
 """Margin m, relative. It is twice the largest plausible skew of a device clock."""
 _BURST_SHARE = 0.5
-"""Share of the advance. A delay that is below the shortest delay by more than this share shows a
-burst."""
+"""Share of the advance of device time. If a message arrives earlier than the shortest delay permits
+by more than this share, it is part of a burst."""
 
 
 class BacklogDelay:

@@ -90,8 +90,8 @@ class CheckedSamples(Refusals):
             if step.restarted:
                 self._gate.forget()
                 ticks = held.sample.ticks
-                clock = "its counter" if ticks is None else f"device time {ticks}"
-                out.append(DeviceEvent("restart", f"device restarted at {clock}"))
+                clock = ": its counter began again" if ticks is None else f" at device time {ticks}"
+                out.append(DeviceEvent("restart", f"device restarted{clock}"))
             out += self._admit(*held)
             lost = step.lost_since
         else:

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     Start = Callable[[SerialPort, bool], Awaitable[None]]
 
 _HUNT_EVERY = 10
-"""Number of connection attempts per search at other speeds. A search takes longer than an
-attempt."""
+"""Number of connection attempts of which one also searches at other speeds. A search takes longer
+than an attempt."""
 
 
 class SerialReception:
@@ -40,8 +40,8 @@ class SerialReception:
         emit : callable
             Function that receives every chunk after the start.
         start : callable
-            Function that makes the device on the open port send. Its second argument states whether
-            it may search for a silent device at other speeds.
+            Function that starts the output of the device on the open port. Its second argument
+            states whether it may search for a silent device at other speeds.
         """
         settings = self._settings
         with SerialPort(settings.port, settings.baud) as port:

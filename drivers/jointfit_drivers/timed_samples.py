@@ -40,7 +40,7 @@ class RawVectors(NamedTuple):
 class TimedReading(NamedTuple):
     """Content of one message: an orientation or raw measurements.
 
-    An invalid message has neither.
+    An invalid message contains neither of them.
     """
 
     size: int

@@ -44,7 +44,7 @@ class ContractDevice(Protocol):
         """Run the device until cancelled."""
 
     def unplug(self) -> None:
-        """Disconnect the wire; a disconnected device or a device before ``run`` is unchanged."""
+        """Disconnect the wire; without effect if it is disconnected, or before ``run``."""
 
     def plug(self) -> None:
         """Connect the wire."""

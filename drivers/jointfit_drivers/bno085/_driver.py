@@ -1,8 +1,8 @@
 """Driver of Bosch / CEVA BNO085 and BNO086 on a serial port.
 
-`RvcDecoder` and `ShtpDecoder` are the pure part. `Bno085Imu.run` opens the port, makes the device
-send and reads until cancelled. The decoder receives only the chunks that `run` emits. The mode of
-the device determines the speed of the port.
+`RvcDecoder` and `ShtpDecoder` are pure: they use no clock and no I/O. `Bno085Imu.run` opens the
+port, starts the output of the device, and reads until it is cancelled. The decoder receives only
+the chunks that `run` emits. The mode of the device determines the speed of the port.
 """
 
 from __future__ import annotations

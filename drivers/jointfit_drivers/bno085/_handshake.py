@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from jointfit_drivers.ports.serial_port import SerialPort
 
 _LISTEN_S = 0.5
-"""Longest wait for a UART-RVC frame, s, equal to fifty frames."""
+"""Longest wait for a UART-RVC frame, s. The device sends fifty frames in this time."""
 _REPLY_S = 0.5
 """Longest wait for a reply, s."""
 _BYTE_PAUSE_S = 0.0002
@@ -132,7 +132,7 @@ async def ensure_shtp(port: SerialPort, emit: Emit, settings: Bno085Settings) ->
     DeviceMisconfiguredError
         The device is of another kind or in another mode, or does not accept the rate.
     """
-    held: list[Chunk] = []  # stamps are late because of pauses
+    held: list[Chunk] = []  # not emitted: the pauses between bytes delay the stamps
     conversation = ShtpConversation(port, held.append)
     conversation.reset()
     if await conversation.control(product_request(), tries=3) is None:

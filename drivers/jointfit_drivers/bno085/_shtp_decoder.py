@@ -56,9 +56,9 @@ _PERIOD_COUNTS = 200
 _STALE_COUNTS = 2
 """Number of gyroscope readings after which an acceleration is too old."""
 _SATURATED = 32_760
-"""Count of a gyroscope or accelerometer from which the reading is out of range."""
+"""Smallest absolute count of a gyroscope or accelerometer that counts as out of range."""
 _NEWEST = NewestKnown((3,), "the host that configures the device")
-"""Newest version of the SH-2 software, which the reference manual describes."""
+"""Newest version of the SH-2 software that the reference manual describes."""
 _CHANNELS = frozenset(map(int, ShtpChannel))
 _RATE_COUNT, _FORCE_COUNT = 2.0**-9, 2.0**-8
 
@@ -162,7 +162,7 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
     def _orientation(self, packet: ShtpPacket, report: HubReport) -> list[Decoded]:
         """Return the sample of a rotation vector.
 
-        The device sends it in the order i, j, k, real.
+        The device sends the components in the order i, j, k, real.
         """
         i, j, k, real = report.values[:4]
         native = (real, i, j, k)
@@ -210,7 +210,7 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         return kind == self._selected
 
     def _step(self, report: HubReport) -> tuple[int, list[Decoded]]:
-        """Return the steps since the last report of this sensor, and the event of a loss."""
+        """Return the number of steps since this sensor's last report, and an event after a loss."""
         last = self._sequences.get(report.report_id)
         self._sequences[report.report_id] = report.sequence
         step = 1 if last is None else (report.sequence - last) % _COUNTS

@@ -13,18 +13,19 @@ retains the gyroscope bias. Without a magnetometer, it continues with the last h
 then uncertain.
 
 A filter that has just started takes its vertical from one accelerometer measurement. In fast motion
-the error is 20 degrees in the first second and 4 degrees in the next two seconds. After that it is
-as small as usual (experiment ``gateway-orientation-start-in-motion``). Orientations are therefore
-returned only when the filter has detected rest or has run for `SETTLE_S`.
+the error of the orientation is 18 degrees in the first second, 6 degrees in the second and 4
+degrees in the third. After that it is as small as usual (experiment
+``gateway-orientation-start-in-motion``). Orientations are therefore returned only when the filter
+has detected rest or has run for `SETTLE_S`.
 
 With a magnetometer, `StartEstimator` then estimates orientation and gyroscope bias from the
 readings since the start, and continues with every reading. Orientations are returned when their
 standard deviation is at most `SETTLED_SD`. VQF takes over the result at the first rest, or when the
-bias is known as well as VQF estimates it in motion, but after `CONVERGE_S` at the latest.
+standard deviation of the bias is at most `KNOWN_BIAS_SD`, or after `CONVERGE_S` at the latest.
 
 A magnetometer has a delay relative to the gyroscope. For the recorded sensor the delay is 13 ms,
-which is an error of 8 degrees at 579 degrees per second. The delay is estimated from the readings
-since the start, and compensated.
+which causes an error of 8 degrees at an angular rate of 579 degrees per second. The delay is
+estimated from the readings since the start, and compensated.
 
 Invariant: the output depends only on the readings fed, so a replay yields identical orientations.
 Only this module imports ``vqf`` (an extra), and it names no device.
@@ -288,7 +289,7 @@ class GatewayOrientation:
         return self._output(reading, follows=follows)
 
     def _settle(self, t_ns: int, waited_ns: int) -> None:
-        """Begin the estimation of the start, and store when the filter has settled."""
+        """Begin to estimate orientation and bias, and record whether the filter has settled."""
         rest = self._filter.getRestDetected()
         if not rest and waited_ns < min(self._settle_ns, SETTLE_S * NS_PER_S):
             return
@@ -385,8 +386,8 @@ def _field_delay(
 
     .. math:: R m = m_w + d\, R (\omega \times m) ,
 
-    which is a linear regression. The ridge of the regression is the ratio of a disturbance of 2 %
-    of the field to a delay of 20 ms. If the rotation is too slow to exceed the ridge, the delay is
+    which is a linear regression. The ridge of the regression assumes a disturbance of 2 % of the
+    field and a delay of 20 ms. If the rotation is too slow to exceed the ridge, the delay is
     unknown. Fields of implausible strength are excluded.
 
     Parameters

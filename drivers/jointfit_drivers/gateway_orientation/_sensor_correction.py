@@ -42,7 +42,7 @@ class SensorCorrection:
         """Date of the calibration."""
 
     def correct(self, reading: RawReading, *, field: bool) -> RawReading:
-        """Return a corrected reading; without `field`, its magnetic field is already correct."""
+        """Return a corrected reading; if `field` is false, the magnetic field remains unchanged."""
         magnetic = reading.magnetic
         if field and magnetic is not None:
             magnetic = _map_vector(magnetic, *self._field)

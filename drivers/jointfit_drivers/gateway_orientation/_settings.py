@@ -27,15 +27,17 @@ class GatewaySettings(ImuSettings):
     )
     magnetometer: bool = Field(
         False,
-        description='with `orientation = "gateway"`: heading by magnetometer, which the device '
-        "must then send at `rate_hz`, too; left out it drifts freely. The same for all IMUs",
+        description='with `orientation = "gateway"`: take the heading from the magnetometer; the '
+        "device must then also send its magnetometer readings at `rate_hz`. Without magnetometer "
+        "the heading drifts. Use the same value for all IMUs of a rig",
     )
     settle_s: float = Field(
         LONGEST_SETTLE_S,
         ge=0,
         le=60,
-        description='with `orientation = "gateway"`: longest time, s, after the start (or a gap) '
-        "without output while the orientation is uncertain; 1.5 s at rest",
+        description='with `orientation = "gateway"`: longest time without samples after a start '
+        "or a gap, s, while the orientation is uncertain (without magnetometer at most 3 s). At "
+        "rest, samples can begin after 1.5 s",
     )
     sensor_calibration: SensorCalibrationSettings | None = Field(
         None,
@@ -81,5 +83,8 @@ class GatewaySettings(ImuSettings):
     def _magnetometer_of_a_filter(cls, magnetometer: bool, info: ValidationInfo) -> bool:
         """Reject the use of a magnetometer if the gateway has no filter."""
         if magnetometer and info.data.get("orientation") == "device":
-            raise ValueError('needs orientation = "gateway": a device uses its own as it is set')
+            raise ValueError(
+                'needs orientation = "gateway": with "device", the settings of the device decide '
+                "whether it uses its magnetometer"
+            )
         return magnetometer

@@ -65,7 +65,8 @@ SCALE_SD = 0.002
 FORCE_SD = 0.3
 """Standard deviation of an accelerometer during motion, m/s^2."""
 REVERSAL_S = 0.3
-"""Time after which a movement reverses, s, which is the correlation time of both errors."""
+"""Time after which a movement reverses, s. It is the correlation time of the errors with the
+standard deviations `SCALE_SD` and `FORCE_SD`."""
 RATE_NOISE = radians(0.02)
 """Noise of the integrated angle of a gyroscope, rad per root second."""
 TILT_SD = radians(1.0)

@@ -20,7 +20,8 @@ _LOST = 0.75
 _DRIFT = 0.1
 """Largest increase of the smallest delay that a difference of the two clocks can cause, periods."""
 _WRONG_RATE = 0.2
-"""Relative difference between mean interval and period from which the rate counts as different."""
+"""Smallest relative difference between mean and nominal interval at which the rate counts as
+wrong."""
 _WINDOWS = 3
 """Number of consecutive windows that prove a different rate."""
 

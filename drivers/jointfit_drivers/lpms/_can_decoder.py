@@ -37,7 +37,8 @@ if TYPE_CHECKING:
     from jointfit_drivers.lpms._can_settings import LpmsCanSettings
 
 _TORN = 20
-"""Number of consecutive frames with incomplete quaternions after which their order is reported."""
+"""Number of consecutive frames of incomplete quaternions after which a warning names the order of
+the frames as the cause."""
 
 
 class LpmsCanDecoder:
@@ -129,7 +130,7 @@ class LpmsCanDecoder:
         if converted is None:
             self._refused += 1
             if self._floats and not self._is_mapped:
-                # The first frame of these floats may contain a quaternion of 16-bit integers.
+                # The bytes that were decoded as floats may be a quaternion of 16-bit integers.
                 floats = [*quaternion.values, *[0.0] * 4]
                 frame = encode_frames(range(FRAMES), floats, "float32")[0]
                 if unit_of(decode_frame(frame.data, "int16") or ()) is not None:
@@ -155,7 +156,7 @@ class LpmsCanDecoder:
             out.append(DeviceEvent("warning", text, {"state": beat.state}))
 
     def _report_incomplete(self, out: list[Decoded]) -> None:
-        """Append the event of lost frames, if their quaternion is not complete."""
+        """Append an event if frames were discarded because their quaternion is incomplete."""
         count = self._codec.incomplete - self._incomplete
         self._incomplete += count
         if not count:

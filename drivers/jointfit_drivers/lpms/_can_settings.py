@@ -30,10 +30,10 @@ _MOST_NODES = 127
 class LpmsCanIdSettings(Settings):
     """CAN identifiers of the four channel frames, as LpmsControl displays them."""
 
-    frame1: int = Field(ge=0, le=STANDARD_MAX, description="first channels")
-    frame2: int = Field(ge=0, le=STANDARD_MAX, description="second frame")
-    frame3: int = Field(ge=0, le=STANDARD_MAX, description="third frame")
-    frame4: int = Field(ge=0, le=STANDARD_MAX, description="fourth frame")
+    frame1: int = Field(ge=0, le=STANDARD_MAX, description="identifier of the first frame")
+    frame2: int = Field(ge=0, le=STANDARD_MAX, description="identifier of the second frame")
+    frame3: int = Field(ge=0, le=STANDARD_MAX, description="identifier of the third frame")
+    frame4: int = Field(ge=0, le=STANDARD_MAX, description="identifier of the fourth frame")
 
     @property
     def frames(self) -> tuple[int, int, int, int]:
@@ -49,11 +49,11 @@ class LpmsCanSettings(CanImuSettings, LpmsConventionSettings):
         "heartbeat; `sequential`: four consecutive identifiers",
     )
     ids: LpmsCanIdSettings = Field(
-        description="its four identifiers; the vendor's sources compute sequential ones by two "
-        "different rules, so that they are never computed here",
+        description="its four identifiers; all four are needed, because the vendor's sources "
+        "compute sequential identifiers by two different rules",
     )
     precision: Literal["int16", "float32"] = Field(
-        description="format of its channels, set with LpmsControl"
+        description="format of its channels, as set with LpmsControl"
     )
     mapping: tuple[int, int, int, int] = Field(
         (1, 2, 3, 4), description="channels that carry w, x, y and z, counted from 1"

@@ -16,7 +16,7 @@ class LpmsConventionSettings(Settings):
         "world_to_sensor",
         description="whether its quaternions map world to sensor coordinates, or the reverse; both "
         "ROS drivers of the vendor invert them, and [a turn by "
-        "hand](devices/lpms.md#convention) settles it",
+        "hand](devices/lpms.md#convention) shows which applies",
     )
     world: Literal["NWU", "ENU", "NED"] = Field(
         "NWU",

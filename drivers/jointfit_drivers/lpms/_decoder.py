@@ -58,7 +58,8 @@ class _Packet(NamedTuple):
     ticks: int
     measurement: LpmsMeasurement
     quaternion: Sequence[float]
-    """Values of the quaternion as sent. The outputs may change while the packet is held."""
+    """Values of the quaternion as sent. They are stored because the outputs may change while the
+    packet is held."""
 
 
 class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):

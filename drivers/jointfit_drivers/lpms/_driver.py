@@ -1,7 +1,8 @@
 """Driver of LP-Research LPMS sensors that use LP-BUS on a serial port or USB.
 
-`LpmsDecoder` is the pure part. `LpmsImu.run` opens the port, starts the stream of the sensor and
-reads until cancelled. The decoder receives only the chunks that `run` emits.
+`LpmsDecoder` is pure: it uses no clock and no I/O. `LpmsImu.run` opens the port, starts the stream
+of the sensor, and reads until it is cancelled. The decoder receives only the chunks that `run`
+emits.
 """
 
 from __future__ import annotations

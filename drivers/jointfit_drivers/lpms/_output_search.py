@@ -1,11 +1,12 @@
 """Place of the quaternion in data packets whose outputs are unknown.
 
-A data packet does not name its outputs. A capture without the replies to the driver's reads, or of
-another program, therefore shows only the length of its packets. The outputs have a fixed order, so
-that few places remain for the quaternion, and its norm is 1 in every packet. An acceleration at
-rest may have norm 1, too, but with a larger deviation.
+A data packet does not name its outputs. If a capture lacks the replies to the driver's requests, or
+if it was recorded while another program used the sensor, only the length of the packets is known.
+The outputs have a fixed order, so few places are possible for the quaternion. The norm of the
+quaternion is 1 in every packet. The norm of an acceleration at rest may also be 1, but with a
+larger deviation.
 
-Invariant: a function of the packets fed; at most `_MOST_HELD` packets are stored.
+Invariant: the result depends only on the packets fed; at most `_MOST_HELD` packets are stored.
 """
 
 from __future__ import annotations
@@ -25,13 +26,15 @@ if TYPE_CHECKING:
     from jointfit_protocols.lpms.configuration import CommandTable, LpmsOutput
 
 _EXAMINED = (4, 16, 32, 64, 128, 256)
-"""Numbers of packets at which the places are examined; few, so that the time is linear."""
+"""Numbers of stored packets at which the places are examined. There are few numbers, so that the
+total time is proportional to the number of packets."""
 _DECIDING, _MOST_HELD = _EXAMINED[1], _EXAMINED[-1]
-"""Packets after which a search ends: with one possible place, and with several."""
+"""Numbers of packets after which a search ends: if one place is possible, and if several are."""
 _TOLERANCE = 0.01
 """Largest deviation of the norm from 1."""
 _CLEARER = 5.0
-"""Least ratio of the deviations of two places of which one is selected."""
+"""Smallest ratio of the second-smallest to the smallest deviation at which the place with the
+smallest deviation is selected."""
 _ROUNDING = 1e-4
 """Deviation of a norm by rounding; smaller deviations are not compared."""
 
@@ -56,12 +59,13 @@ class OutputSearch:
         self._table = table
         self._alone = PacketLayout(table, table.quaternion)
         self.layout = self._alone
-        """Layout of the packets: quaternion alone until another layout is found."""
+        """Layout of the packets. Until another layout is found, packets contain the quaternion
+        alone."""
         self._candidates: dict[int, list[PacketLayout]] = {}
         self._size: int | None = None  # of the packets that `layout` describes
         self._held: list[ArrivedPacket] = []
         self.events: list[Decoded] = []
-        """Events since they were last taken."""
+        """Events that were not returned yet."""
 
     def take(self, packet: ArrivedPacket) -> list[ArrivedPacket]:
         """Add a packet; return the packets, in order, that can be decoded by `layout`."""
@@ -101,15 +105,15 @@ class OutputSearch:
             precision = "float32" if self._size == layout.sizes[0] else "int16"
             text = (
                 f"its outputs are unknown, because it sent no reply with its settings: values "
-                f"{place.start + 1} to {place.stop} of {layout.values} ({precision}) are the "
-                "quaternion by their norm"
+                f"{place.start + 1} to {place.stop} of {layout.values} ({precision}) "
+                "have norm 1 and are used as the quaternion"
             )
             known = {"first_value": place.start + 1, "precision": precision}
             self.events.append(DeviceEvent("info", text, known))
         return ready
 
     def _find(self) -> list[PacketLayout]:
-        """Return the layouts that fit the stored packets; one if it fits clearly best."""
+        """Return the layouts that fit the stored packets, or only one if it fits clearly best."""
         rated = []
         size = len(self._held[0].message.data)
         if size not in self._candidates:
@@ -141,7 +145,7 @@ class OutputSearch:
 
 
 def _masks(outputs: Sequence[LpmsOutput]) -> dict[int, int]:
-    """Return a mask for each possible number of values of some of the outputs."""
+    """Return, for each number of values that a subset of `outputs` can have, one such mask."""
     masks = {0: 0}
     for output in outputs:
         for count, mask in list(masks.items()):

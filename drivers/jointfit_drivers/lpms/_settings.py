@@ -22,7 +22,7 @@ class LpmsSettings(SerialImuSettings, LpmsConventionSettings):
 
     generation: Literal[1, 3] = Field(
         description="1: B2, CU2, URS2, CURS2, AL2, ME1; 3: LPMS3, IG1, BE1, NAV3. Their commands "
-        "conflict, a read of one erases the settings of the other",
+        "conflict: a read command of one erases the settings of the other",
     )
     sensor_id: int = Field(1, ge=0, le=65535, description="address of the sensor in its messages")
     precision: Literal["float32", "int16"] = Field(

@@ -18,10 +18,11 @@ _SPAN_NS = 3_000_000_000
 _CONTRADICTIONS = 2
 """Number of consecutive spans that prove another unit."""
 _NEAR = 0.05
-"""Largest relative deviation of a measured rate."""
+"""Largest relative deviation of a measured rate from the rate that it confirms."""
 _MOST_RATIO = 4.0
-"""Largest ratio of an unusual rate to the configured one that is reported. The stamps of a file of
-raw bytes are not arrivals: they are closer together."""
+"""Largest ratio of a measured rate to the configured rate, or the reverse, at which an unusual rate
+is reported. In a file of raw bytes, the stamps are not arrival times and are closer together, so
+the ratio is larger."""
 _USUAL_HZ = (400, 500, 800, 1000)
 
 

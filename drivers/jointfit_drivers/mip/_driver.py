@@ -1,7 +1,7 @@
 """Driver of MicroStrain IMUs that use MIP on a serial port or USB.
 
-`MipDecoder` is the pure part. `MipImu.run` opens the port, makes the device stream and reads until
-cancelled. The decoder receives only the chunks that `run` emits.
+`MipDecoder` is pure: it uses no clock and no I/O. `MipImu.run` opens the port, starts the stream of
+the device, and reads until it is cancelled. The decoder receives only the chunks that `run` emits.
 """
 
 from __future__ import annotations

@@ -9,14 +9,16 @@ from __future__ import annotations
 from typing import NamedTuple
 
 _REORDERED = 100
-"""Largest decrease of the number of a reordered datagram. More is a restart or a loop."""
+"""Largest decrease of the number of a reordered datagram. A larger decrease is a restart of the
+server or of a recording that is played in a loop."""
 _FASTEST_HZ = 2000
-"""Upper limit of the frame rate of camera systems, Hz. A larger step of the number is not caused by
-lost frames."""
+"""Upper limit of the frame rate of camera systems, Hz. If the number increases faster, frames were
+not lost, but the server restarted."""
 _BURST = 2000
 """Largest number of frames that may arrive at once, from a queue that was emptied."""
 _LATE_RUN = 10
-"""Number of consecutive late frames that are no reordering, but a short loop of a recording."""
+"""Number of consecutive frames with a decreased number after which they count as a short recording
+in a loop, not as reordered datagrams."""
 
 
 class FrameStep(NamedTuple):

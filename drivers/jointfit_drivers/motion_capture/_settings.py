@@ -37,7 +37,9 @@ class ServerSettings(MocapSettings):
         description="IPv4 address or name of this host's network card towards the cameras;"
         " default: the card that routes to the server",
     )
-    silence_s: float = Field(5.0, gt=0, description="no frame for this long is a lost server, s")
+    silence_s: float = Field(
+        5.0, gt=0, description="time without a frame after which the server counts as lost, s"
+    )
 
     @field_validator("server")
     @classmethod

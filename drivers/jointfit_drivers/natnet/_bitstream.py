@@ -67,7 +67,7 @@ class BitstreamTracker:
         self._confirmed = version
 
     def select_sets(self, names: frozenset[str]) -> None:
-        """Skip other marker sets and unlabeled markers if this saves time."""
+        """Skip unlabeled markers and all marker sets except `names`, if this saves time."""
         if names != self._selected:
             self._selected = names
             self._layouts.clear()

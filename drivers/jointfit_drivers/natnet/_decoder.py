@@ -38,7 +38,7 @@ their size."""
 _NAMED_UNKNOWN = 16
 """Largest number of unknown ids in warnings. Further ids are only counted."""
 _MOST_SECONDS = 2**63 // 10**9
-"""Largest plausible stamp, s, whose value in nanoseconds fits into 64 bits."""
+"""Largest accepted stamp, s. Its value in nanoseconds fits into 64 bits."""
 _ANNOUNCED = {
     natnet.FRAME_MODEL_CHANGED: "the model list changed",
     natnet.FRAME_BITSTREAM_CHANGED: "the bitstream version changed",

@@ -44,7 +44,7 @@ class FrameTime:
         return _UNIX if self._precise is not None and self._precise.decided else None
 
     def unix_ns(self, frame: FrameOfData, out: list[Decoded]) -> int | None:
-        """Return the UNIX time of a frame; None if it has none, which is reported once."""
+        """Return the UNIX time of a frame; None if the frame has none, which causes one warning."""
         precise = self._precise
         if precise is None:
             return None

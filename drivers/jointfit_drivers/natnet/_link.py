@@ -35,7 +35,8 @@ _FLEETING = {errno.ENOBUFS, errno.EMSGSIZE, errno.EINTR}
 _FORGED_NS = 100_000_000
 """Time after a datagram from the server for which an ICMP refusal is ignored, ns.
 
-A server that has just sent a datagram does not refuse, so the ICMP message is forged or stale."""
+A server that has just sent a datagram does not refuse datagrams, so the ICMP message is forged or
+stale."""
 
 
 class NatNetLink(SocketLink):

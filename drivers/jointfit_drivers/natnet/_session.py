@@ -242,7 +242,7 @@ class NatNetSession:
             if info.clock_hz and now >= echo_at:
                 self._send(natnet.EchoRequest(time.monotonic_ns()))
                 echoes += 1
-                usual_s = random.uniform(*ECHO_S)  # noqa: S311 - out of step, not secret
+                usual_s = random.uniform(*ECHO_S)  # noqa: S311 - it need not be secret
                 echo_at = now + (FIRST_ECHO_S if echoes < FIRST_ECHOES else usual_s)
 
             if unicast and now >= alive_at:

@@ -277,8 +277,8 @@ def _socket(bus: can.BusABC) -> socket.socket:
 def _require_server(bus: can.BusABC) -> None:
     """Raise `DeviceLostError` if a socketcand server has closed the connection.
 
-    python-can does not report this. It returns no message at once, without an error. It also has no
-    public access to the socket.
+    python-can does not report this: its receive function returns None at once, without an error. It
+    also gives no public access to the socket.
     """
     sock: socket.socket | None = getattr(bus, "_SocketCanDaemonBus__socket", None)
     try:

@@ -1,7 +1,7 @@
-"""A timer that detects the silence of one device, and that arrivals do not set again.
+"""A timer that detects the silence of one device, and that arrivals do not restart.
 
-Invariant: an arrival costs one reading of the clock. Only when the event loop's timer ends, it is
-set again for the rest of the permitted silence.
+Invariant: an arrival costs only one reading of the clock. When the event loop's timer ends, it is
+restarted for the rest of the permitted silence.
 """
 
 from __future__ import annotations

@@ -121,7 +121,7 @@ class SlcanBus:
             while self._early:
                 deliver(*self._early.pop(0))
             await self._port.pump(take, None)  # each subscriber checks its own silence
-        except Exception as error:  # noqa: BLE001 - handed to every subscriber, who raises it
+        except Exception as error:  # noqa: BLE001 - every subscriber raises it
             failed(error)
 
     async def _handshake(self) -> None:
@@ -160,7 +160,7 @@ class SlcanBus:
             log.debug("%s: the adapter sends no answers; reading anyway", settings.channel)
 
     async def _ask(self, command: bytes, expected: str = "") -> str | None:
-        """Send `command`; return the letter of the answer: `expected`, BELL, or None if none."""
+        """Send `command`; return the letter of its answer (`expected` or BELL), or None."""
         await self._port.write(command)
         loop = asyncio.get_running_loop()
         until = loop.time() + _ANSWER_S

@@ -41,8 +41,8 @@ CanKey = tuple[int, bool]
 """Identifier of a frame, and whether it has 29 bits."""
 
 _UNCLAIMED = 512
-"""Largest number of stored frames without subscriber, equal to a third of a second of four sensors
-at 400 Hz."""
+"""Largest number of stored frames without subscriber. Four sensors at 400 Hz send as many frames in
+a third of a second."""
 _CLAIM_NS = 300_000_000
 """Largest age of stored frames that are delivered to a new subscriber, ns. The devices of a rig
 start at almost the same time, so their first frames may arrive before they subscribe."""
@@ -242,7 +242,7 @@ class SharedBus:
         *,
         worked: bool,
     ) -> str:
-        """Return a text with the missing identifier of a silent device and those received.
+        """Return a text that names the missing identifier of a silent device and the received ones.
 
         The text is the same as long as the findings are the same.
         """
@@ -291,7 +291,7 @@ class SharedBus:
         return any(key in ids for ids in self._ids.values())
 
     def _filter(self) -> None:
-        """Let the kernel filter unclaimed frames when every device receives its frames."""
+        """Make the kernel drop unclaimed frames as soon as every device receives its frames."""
         if self._backend is not None and self._failed is None:
             complete = all(each.is_complete for each in self._subscribers)
             self._backend.listen(self._routes if complete else None)

@@ -57,8 +57,8 @@ _LOST: dict[int, str] = {
     errno.EPROTO: "returns a USB protocol error",
     errno.ETIMEDOUT: "does not answer the USB host in time",
 }
-"""Texts of common errors, all of which may end by themselves. EACCES does, because a port that is
-plugged in exists before udev has set its group."""
+"""Texts of common errors that may end without a change of the settings. EACCES is one of them,
+because a port that has just been plugged in exists before udev has set its group."""
 
 _ABSENT = frozenset({errno.ENOENT, errno.ENODEV, errno.ENXIO})
 """Error numbers that mean that the port is unplugged."""

@@ -1,7 +1,7 @@
 """Driver of Qualisys Track Manager by its real-time protocol, over TCP and UDP.
 
-`QtmDecoder` is the pure part. `QtmMocap.run` connects and emits every packet of the server. This
-includes the answers, so a replay has the same input as the live decoder.
+`QtmDecoder` is pure: it uses no clock and no I/O. `QtmMocap.run` connects and emits every packet of
+the server. This includes the answers, so a replay has the same input as the live decoder.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Parts of one frame: over UDP, a frame may arrive as several packets with the same number.
 
 Invariant: the module is pure. A frame is complete when it has every component that the settings
-announce, or when a packet of another frame arrives. If a component does not arrive repeatedly,
-frames no longer wait for it.
+announce, or when a packet of another frame arrives. If a component is missing in `_PATIENCE`
+consecutive frames, frames no longer wait for it.
 """
 
 from __future__ import annotations

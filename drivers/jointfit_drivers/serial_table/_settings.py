@@ -85,8 +85,10 @@ class NumberSettings(Settings):
 class LengthSettings(NumberSettings):
     """The length of the frame, in the frame."""
 
-    adds: int = Field(0, description="bytes of the whole frame minus this number")
-    longest: int = Field(LONGEST_FRAME, ge=4, le=LONGEST_FRAME, description="most bytes of a frame")
+    adds: int = Field(0, description="size of the whole frame minus this number, bytes")
+    longest: int = Field(
+        LONGEST_FRAME, ge=4, le=LONGEST_FRAME, description="size of the largest frame, bytes"
+    )
 
 
 class MessageSettings(NumberSettings):
@@ -100,7 +102,7 @@ class FrameSettings(Settings):
 
     sync: str = Field(description="first bytes of every frame, hexadecimal", examples=["AA 55"])
     length: int | None = Field(
-        None, ge=2, le=LONGEST_FRAME, description="bytes of the whole frame, if all have the same"
+        None, ge=2, le=LONGEST_FRAME, description="size of every frame, bytes"
     )
     length_field: LengthSettings | None = Field(
         None, description="length in the frame, instead of `length`"

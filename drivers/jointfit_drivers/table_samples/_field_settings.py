@@ -89,7 +89,9 @@ class ChecksumSettings(Settings):
 
     kind: ChecksumKind = Field(description=f"one of {', '.join(WIDTHS)}", examples=["sum8"])
     first: int = Field(
-        0, ge=0, description="first byte that it includes; it includes all up to itself"
+        0,
+        ge=0,
+        description="first byte of the frame that it includes; the last is the byte before it",
     )
     byte_order: Literal["little", "big"] | None = Field(
         None,

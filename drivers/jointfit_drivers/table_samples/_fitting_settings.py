@@ -33,7 +33,8 @@ _DIVISORS = (
 )  # fmt: skip
 """Numbers of counts per unit that devices use."""
 _SNAP = {"quaternion": 0.01, "acceleration": 0.12}
-"""Largest relative deviation from one of these numbers with which it replaces the measured one."""
+"""Largest relative deviation of a measured number of counts per unit from one of `_DIVISORS`, with
+which this divisor replaces the measured number."""
 _KNOWN_SCALE = 1e-9
 
 

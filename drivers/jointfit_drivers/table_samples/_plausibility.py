@@ -25,7 +25,8 @@ _ROUND = 0.05
 _LIGHT, _HEAVY = 6.0, 14.0
 """Plausible range of the median specific force, m/s^2. Outside of it, the scale is wrong."""
 _GOOD, _CALM = 0.75, 0.5
-"""Smallest shares of quaternions and of specific forces whose norm is in range."""
+"""Smallest shares, for a correct table, of quaternions and of specific forces whose norm is in
+range."""
 _TIMED = 200
 """Number of records after which the unit of device time is checked."""
 _TIMED_NS = 2_000_000_000

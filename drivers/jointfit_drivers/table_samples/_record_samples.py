@@ -1,7 +1,8 @@
 """Conversion of records to samples in SI units, for a device that a table describes.
 
-Invariant: the output depends only on the records. The module reads no clock and no port. Every
-record becomes one sample, or is rejected with a reason.
+Invariant: the output depends only on the records. The module reads no clock and no port. A record
+with an orientation becomes one sample, or is rejected with a reason. For raw measurements, the
+filter returns no sample while it settles.
 """
 
 from __future__ import annotations
@@ -32,10 +33,11 @@ if TYPE_CHECKING:
     from jointfit_protocols.orientation import Quaternion
 
 _COARSE = 1e-4
-"""Value of one count from which rounding changes the norm of a quaternion noticeably."""
+"""Smallest value of one count with which rounding changes the norm of a quaternion noticeably."""
 _TOLERANCE, _COARSE_TOLERANCE = 0.01, 0.05
 _RECHECK = 100
-"""Number of rejected records after which the settings are checked again. It then grows tenfold."""
+"""Number of rejected records after which the settings are checked again. After each check the
+number is multiplied by ten."""
 
 
 class RecordSamples(Refusals):
@@ -124,8 +126,8 @@ class RecordSamples(Refusals):
             self._raw_ns, self._raw_at = 0, -1
             if self._checks is not None:
                 self._checks.forget()
-            clock = "its counter" if ticks is None else f"device time {ticks}"
-            out.append(DeviceEvent("restart", f"device restarted at {clock}"))
+            clock = ": its counter began again" if ticks is None else f" at device time {ticks}"
+            out.append(DeviceEvent("restart", f"device restarted{clock}"))
         return out + self._sample(held, ticks, self._count(held.values))
 
     @override
@@ -178,7 +180,7 @@ class RecordSamples(Refusals):
         if clock is None:
             now, passed_ns = record.arrival_ns, float(record.arrival_ns - self._raw_at)
         else:
-            if stamp.ticks is None:  # its frame was lost
+            if stamp.ticks is None:  # the CAN frame with the device time was lost
                 return [self.refuse(record.size, "raw measurements without device time")]
             now, modulus = stamp.ticks, clock.modulus
             step = now - self._raw_at
@@ -188,9 +190,8 @@ class RecordSamples(Refusals):
         magnetic = _vector(si, self._magnetic) if raw.magnetometer else None
         reading = RawReading(t_ns, cast("Vector", rate), cast("Vector", force), magnetic)
         if now == self._raw_at or not is_plausible(reading):
-            return [
-                self.refuse(record.size, "raw measurements out of range, or of the same instant")
-            ]
+            reason = "raw measurements out of range, or with the time of the previous ones"
+            return [self.refuse(record.size, reason)]
         self._raw_ns, self._raw_at = t_ns, now
         clipped = any(
             value in limits for value, limits in zip(record.values, self._limits, strict=False)

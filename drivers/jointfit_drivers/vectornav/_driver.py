@@ -1,7 +1,8 @@
 """Driver of VectorNav IMUs on a serial port or USB.
 
-`VectorNavDecoder` is the pure part. `VectorNavImu.run` opens the port, makes the device stream and
-reads until cancelled. The decoder receives only the chunks that `run` emits.
+`VectorNavDecoder` is pure: it uses no clock and no I/O. `VectorNavImu.run` opens the port, starts
+the stream of the device, and reads until cancelled. The decoder receives only the chunks that `run`
+emits.
 """
 
 from __future__ import annotations

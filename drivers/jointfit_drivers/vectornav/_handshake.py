@@ -42,7 +42,7 @@ _REPLY_S, _STORE_S = 0.5, 3.0
 """Longest wait for a reply, and until all registers are stored, s."""
 _IMU_RATES = {"VN-3": 400}
 _IMU_RATE = 800
-"""Rate of the IMU, Hz: by the beginning of the model name, and for all other models."""
+"""Rates of the IMU, Hz: for models whose name begins with a key of the table, and for others."""
 
 
 class VectorNavHandshake:

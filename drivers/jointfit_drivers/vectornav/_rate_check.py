@@ -1,8 +1,8 @@
-"""Comparison of the rate of a stream with the configured rate; pure.
+"""Comparison of the rate of a stream with the configured rate.
 
 The driver computes the divisor of its output from a nominal rate of the IMU, which is 400 or 800 Hz
 depending on the model. If the IMU of a device has a different rate, the rate of the stream is
-wrong, and the device reports no error.
+wrong, and the device reports no error. The module is pure.
 """
 
 from __future__ import annotations

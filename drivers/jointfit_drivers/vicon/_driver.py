@@ -1,7 +1,7 @@
 """Driver of Vicon Nexus, Tracker, Shogun, Evoke and Blade, by the protocol DataStream over TCP.
 
-`ViconDecoder` is the pure part. `ViconMocap.run` connects and emits every packet of the server, so
-that a replay has the same input as the live decoder.
+`ViconDecoder` is pure: it uses no clock and no I/O. `ViconMocap.run` connects and emits every
+packet of the server, so that a replay has the same input as the live decoder.
 """
 
 from __future__ import annotations

@@ -139,7 +139,7 @@ class ViconSession:
 
 
 def wanted_ids(offered: frozenset[int]) -> frozenset[int]:
-    """Return the ids to request; light segments are requested only without global segments."""
+    """Return the ids to request; light-weight segments only if no global segments are offered."""
     wanted = _WANTED
     if ObjectId.GLOBAL_SEGMENTS not in offered:
         wanted |= {ObjectId.LIGHT_SEGMENTS}

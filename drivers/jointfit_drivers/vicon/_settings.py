@@ -27,7 +27,8 @@ class ViconSettings(ServerSettings):
         2.0,
         ge=0,
         le=1000,
-        description="delay from exposure to arrival besides that which the server announces, ms",
+        description="the part of the delay from exposure to arrival that the server does not "
+        "announce, ms",
     )
 
     @property

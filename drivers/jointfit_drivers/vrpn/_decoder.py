@@ -105,7 +105,7 @@ class VrpnDecoder:
 
     @property
     def late_reports(self) -> int:
-        """Number of reports dropped because their frame had ended or a later one had arrived."""
+        """Number of reports dropped because their frame had ended or a later report had arrived."""
         return self._assembler.late
 
     @property

@@ -1,7 +1,7 @@
 """Driver of motion-capture systems with a VRPN server.
 
-`VrpnDecoder` is the pure part. `VrpnMocap.run` connects and emits complete messages in the order of
-arrival, so that a replay has the same input as the live decoder.
+`VrpnDecoder` is pure: it uses no clock and no I/O. `VrpnMocap.run` connects and emits complete
+messages in the order of arrival, so that a replay has the same input as the live decoder.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Conversion of the calendar time of a WitMotion device to a continuous time.
 
 The clock starts at an arbitrary date and may glitch. A time that contradicts the arrivals is not
-used. If the next times continue it, the clock was set, and its times are used again.
+used. If the next times continue the rejected time, the clock was set, and its times are used again.
 
 Invariant: the result depends only on the times and arrivals fed.
 """

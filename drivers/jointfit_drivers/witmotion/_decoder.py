@@ -43,7 +43,7 @@ _CHECKED_FRAMES = 100
 _OTHER_FRAMES = 3
 """Number of frames that identify the variant 55 61. Noise may contain one such frame by chance."""
 _MOST_COUNT = 32_700
-"""Count from which an acceleration or rate is out of range."""
+"""Smallest absolute count of an acceleration or rate that is out of range."""
 _SCALE = 1.0 / FULL_SCALE
 _TIME = int(WitMotionFrameKind.TIME)
 _ACCELERATION = int(WitMotionFrameKind.ACCELERATION)

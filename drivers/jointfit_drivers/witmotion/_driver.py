@@ -1,7 +1,8 @@
 """Driver of WitMotion IMUs (WT901, JY901, HWT905 and relatives) on a serial port.
 
-`WitMotionDecoder` is the pure part. `WitMotionImu.run` opens the port, makes the device send the
-required frames and reads until cancelled. The decoder receives only the chunks that `run` emits.
+`WitMotionDecoder` is pure: it uses no clock and no I/O. `WitMotionImu.run` opens the port, makes
+the device send the required frames and reads until cancelled. The decoder receives only the chunks
+that `run` emits.
 """
 
 from __future__ import annotations

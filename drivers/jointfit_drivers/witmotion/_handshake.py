@@ -45,10 +45,10 @@ log = logging.getLogger(__name__)
 LINE_SPEEDS = (115_200, 9_600, 921_600, 230_400, 460_800, 57_600, 38_400, 19_200)
 """Line speeds for the search, bit/s: usual speed and factory setting first."""
 _LISTEN_S = 0.6
-"""Longest time to receive the required frames, s, equal to five samples at the factory rate of 10
-Hz."""
+"""Longest time to receive the required frames, s. It suffices for five samples at the factory rate
+of 10 Hz."""
 _SEARCH_S = 0.25
-"""Duration of the search at each other speed, s, equal to two samples at 10 Hz."""
+"""Duration of the search at each other speed, s. It suffices for two samples at 10 Hz."""
 _ANSWER_S = 0.3
 """Longest wait for the answer to a read command, s."""
 _COMMAND_PAUSE_S = 0.1

@@ -46,7 +46,7 @@ _PACE_NS = 250_000_000
 _LATEST_NS = 30_000_000_000
 """Longest delay of the first messages after opening, ns."""
 _DISTINCT = 50_000
-"""Longest gap in which counter and time can disagree, counts.
+"""Longest gap in which a contradiction between counter and time can be detected, counts.
 
 After a longer gap, the permitted difference includes any pair of counter and time."""
 
@@ -195,7 +195,7 @@ class XbusContinuity:
     def _follows(self, last: _OrientationPoint, point: _OrientationPoint) -> bool:
         ticks, counts = self._ticks(last, point), _counts(last, point)
         if (ticks is None) != (last.ticks is None) or (counts is None) != (last.counter is None):
-            return False  # the set of fields differs from the stream's
+            return False  # the fields of `point` differ from those before
 
         few = _SLACK_COUNTS + 1
         if ticks is None:
@@ -235,7 +235,7 @@ class XbusContinuity:
         return step
 
     def _agree(self, ticks: int, counts: int) -> bool:
-        """Return whether `ticks` and `counts` agree at this rate, modulo the counter's width."""
+        """Return whether `ticks` and `counts` agree at the measured rate, modulo `_COUNTS`."""
         expected = round(ticks / self._period)
         off = (counts - expected) % _COUNTS
         return min(off, _COUNTS - off) <= _SLACK_COUNTS + _SLACK_SHARE * expected

@@ -33,7 +33,7 @@ _QUIET_S = 0.1
 """Pause after which the rest of a message with a corrupt length is no longer expected, s."""
 _KNOWN = frozenset(map(int, XbusMessageId))
 _OTHER_ADDRESS = 0x01
-"""Bus address that a stand-alone device also uses in replies."""
+"""Second bus address that a stand-alone device may use in replies."""
 _KEPT = 8192
 """Number of bytes stored before the acknowledgement. It exceeds one message of the largest length,
 whose data may look like an acknowledgement by chance."""

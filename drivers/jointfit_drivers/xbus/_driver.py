@@ -1,7 +1,8 @@
 """Driver of Xsens / Movella IMUs that use Xbus on a serial port or USB.
 
-`XbusDecoder` is the pure part. `XbusImu.run` opens the port, brings the device into measurement
-mode and reads until cancelled. The decoder receives only the chunks that `run` emits.
+`XbusDecoder` is pure: it uses no clock and no I/O. `XbusImu.run` opens the port, brings the device
+into measurement mode and reads until cancelled. The decoder receives only the chunks that `run`
+emits.
 """
 
 from __future__ import annotations

@@ -34,10 +34,10 @@ LINE_SPEEDS = (921_600, 115_200, 460_800, 230_400, 2_000_000, 57_600, 38_400, 19
 _LISTEN_S = 0.15
 """Duration of the search at each speed, s. An acknowledgement takes 10 ms at 9600 baud."""
 _RESETS, _RESET_WAIT_S = 50, 0.1
-"""Number of requests after a reset, and their interval, s. A stuck MTi-G-700 answered 1.8 s after
-its reset."""
+"""Number of requests after a reset, and the interval between them, s. An MTi-G-700 that had not
+answered before replied 1.8 s after its reset."""
 _FRAMES = (0, 1)
-"""Numbers of the two frames that alignment rotations refer to: sensor and local."""
+"""Numbers of the two coordinate frames that alignment rotations refer to: sensor and local."""
 _UNKNOWN_MESSAGE = b"\x04"
 """Error code that a device sends for an unknown message."""
 _RATE_SHARE = 0.01

@@ -94,7 +94,7 @@ class LegacyMeasurements:
 
 
 def _of_matrix(by_columns: tuple[float, ...]) -> Quaternion:
-    """Return the quaternion of a matrix by columns. Its norm is 1 only for a rotation."""
+    """Return the quaternion of a matrix by columns; only a rotation matrix yields the norm 1."""
     a, d, g, b, e, h, c, f, i = by_columns
     # Shepperd (1978): the largest component is the most accurate.
     squares = (1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i)

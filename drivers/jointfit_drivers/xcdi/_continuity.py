@@ -36,7 +36,8 @@ _LEARNED = 10
 """Number of steps after which the measured period is used."""
 _SLACK_COUNTS = 2
 _NEAR = 10
-"""Largest number of counts that corrupt values of counter and time may seem to skip."""
+"""Largest difference between the steps of counter and time that counts as corruption, not as a
+jump, groups."""
 _SLACK_SHARE = 0.01
 _SILENT = _NEAR + 1
 """Shortest silence over which SampleTime is compared with host time, groups."""
@@ -54,7 +55,8 @@ _WINDOW = 20
 _CONTRADICTIONS = 3
 _BROKEN = 14
 _ASTRAY = 8
-"""Number of consecutive contradictions that no second sensor explains; the period then changed."""
+"""Number of consecutive contradictions after which, if no second sensor explains them, the period
+is measured again."""
 
 
 class XcdiStep(NamedTuple):

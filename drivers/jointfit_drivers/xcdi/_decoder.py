@@ -151,7 +151,8 @@ class XcdiDecoder:
         """Discard a group that no later group confirmed."""
         held, self._held = self._held, None
         if held is not None:
-            self._gate.admit(_native(held))  # a wrong byte order also makes time and counter jump
+            # The norm is checked, because a wrong byte order also makes time and counter jump.
+            self._gate.admit(_native(held))
             self._check_norm(out)
             self._refuse("counter and time disagree with the other messages", out)
 

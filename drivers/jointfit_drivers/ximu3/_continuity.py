@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 _FEW = 5.5
 """Largest number of periods between two successive messages."""
 _FIRST_US = 1_000_000
-"""Time within which a message follows while the period is unknown, us. It permits a device at 1
-Hz."""
+"""Longest step of device time to the next message while the period is unknown, us. It permits a
+device at 1 Hz."""
 _EXTRAPOLATED = 2.5
 """Longest interval over which motion is extrapolated, periods."""
 _STEADY = 0.005

@@ -51,7 +51,7 @@ _UNUSABLE = {
     DataKind.EULER: "Euler angles are not finite",
 }
 _NEWEST = NewestKnown((1,), "the x-IMU3 GUI")
-"""Newest supported firmware, which API 1.9 of the vendor's software reads."""
+"""Newest supported firmware: the newest that API 1.9 of the vendor's software can read."""
 _OLD_PULSE_US = 10_000_000
 """Largest difference, us, between an edge and the last measurement."""
 _LONGEST_VERSION = 32

@@ -1,4 +1,4 @@
-"""Conversion of an x-IMU3's properties, settings and messages to events, measurements excepted."""
+"""Conversion of the replies and messages of an x-IMU3, except measurements, to events."""
 
 from __future__ import annotations
 

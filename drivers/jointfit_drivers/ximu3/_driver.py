@@ -1,7 +1,8 @@
 """Driver of x-io x-IMU3 on a serial port or USB, and of boards that send its messages.
 
-`XImu3Decoder` is the pure part. `XImu3Imu.run` opens the port, checks the settings of the device
-and reads until cancelled. The decoder receives only the chunks that `run` emits.
+`XImu3Decoder` is pure: it uses no clock and no I/O. `XImu3Imu.run` opens the port, checks the
+settings of the device and reads until cancelled. The decoder receives only the chunks that `run`
+emits.
 """
 
 from __future__ import annotations

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from jointfit_drivers.ximu3._settings import XImu3Settings
 
 _LISTEN_S = 2.0
-"""Longest wait for the first expected message, s. A device at 1 Hz sends two messages in it."""
+"""Longest wait for the first expected message, s. A device at 1 Hz sends two messages in this
+time."""
 
 
 async def ensure_expected_messages(

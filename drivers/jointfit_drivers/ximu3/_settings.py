@@ -96,5 +96,5 @@ def nearest_divisors(rate_hz: float) -> tuple[int, int]:
 
 
 _TOLERANCE = 1e-3
-"""Largest relative difference between a configured rate and a fraction of the base rate, so that
-133.3 means 400/3."""
+"""Largest relative difference between a configured rate and the fraction of the base rate that it
+stands for. For example, 133.3 stands for 400/3."""

@@ -152,7 +152,7 @@ def decode_report(report: bytes) -> HubReport | None:
 def decode_gyro_rotations(payload: bytes) -> list[tuple[float, ...]] | None:
     """Return i j k real, and the rate of turn, rad/s, of each gyro rotation vector of a packet.
 
-    None if they do not fill the packet.
+    Return None if the vectors do not fill the packet.
     """
     if not payload or len(payload) % _GYRO_ROTATION.size:
         return None

@@ -10,7 +10,7 @@ replayed exactly.
     flags: 1 extended (29-bit), 2 remote request, 4 error frame
 
 Error frames have the layout of Linux (linux/can/error.h), in which the identifier is a set of error
-classes. This project uses two classes that Linux does not use for notes of the host; see
+classes. For notes of the host, this project uses two classes that Linux does not use; see
 `host_dropped` and `host_corrupt`.
 
 Invariant: unpacking never raises an exception. A record that is not a CAN frame becomes
@@ -31,11 +31,11 @@ RECORD_BYTES = 24
 STANDARD_MAX = 0x7FF
 EXTENDED_MAX = 0x1FFF_FFFF
 HOST_DROPPED = 1 << 28
-"""Error class of this project: the host lost frames. The data are their number, u64
+"""Error class of this project: the host lost frames. The data are the number of these frames, u64
 little-endian."""
 HOST_CORRUPT = 1 << 27
-"""Error class of this project: bytes of an adapter's line without a frame. The data are their
-number."""
+"""Error class of this project: bytes on an adapter's line formed no frame. The data are the number
+of these bytes, u64 little-endian."""
 
 _RECORD = struct.Struct("<qIBBxx8s")
 _COUNT = struct.Struct("<Q")

@@ -61,8 +61,8 @@ def sequential_ids(
     """Return the identifiers of a node in sequential mode.
 
     The vendor's sources disagree. According to the page on LPMS3, the identifiers are ``start_id +
-    node + k``, so those of adjacent nodes overlap. According to the firmware of 2013 and another
-    page, they are ``start_id + 8 (node - 1) + k`` (`spaced`).
+    node + k``, so the identifiers of adjacent nodes overlap. According to the firmware of 2013 and
+    another page, they are ``start_id + 8 (node - 1) + k`` (`spaced`).
     """
     base = start_id + (8 * (node - 1) if spaced else node)
     return base, base + 1, base + 2, base + 3

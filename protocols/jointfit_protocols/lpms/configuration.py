@@ -17,7 +17,7 @@ that reads a setting in one generation may write a setting in the other:
 | 5B                    | device name, text                  | filter mode, U4                  |
 
 The settings are lost at power-off unless they are stored, because the firmware of 2013 writes its
-registers in memory.
+registers to memory, not to flash.
 
 Source: the vendor's register headers (OpenMAT), protocol pages and firmware source of 2013. The
 command 5B was not tested on hardware; both headers list it as a read command.

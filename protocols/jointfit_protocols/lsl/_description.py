@@ -53,7 +53,7 @@ def parse_description(data: bytes) -> StreamDescription | str:
     """Return the description in an XML document, or the reason why there is no valid one."""
     if len(data) > _LARGEST_XML:
         return "description too long"
-    if b"<!" in data:  # entities could grow
+    if b"<!" in data:  # may define entities that expand to a text of any size
         return "description with a document type"
     try:
         root = ET.fromstring(data)  # noqa: S314 - without a document type there are no entities
@@ -64,7 +64,7 @@ def parse_description(data: bytes) -> StreamDescription | str:
     if not (count.isascii() and count.isdecimal() and len(count) < 8):  # noqa: PLR2004 - digits
         return "description without a number of channels"
     if not 0 < int(count) <= MOST_CHANNELS:
-        return f"{count} channels"
+        return f"{count} channels, expected 1 to {MOST_CHANNELS}"
     described = root.findall("desc/channels/channel")
     channels = tuple(Channel(*(_text(one, name) for name in Channel._fields)) for one in described)
     return StreamDescription(

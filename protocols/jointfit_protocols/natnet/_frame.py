@@ -143,7 +143,7 @@ class FrameOfData(NamedTuple):
 
 
 def is_supported(version: Version) -> bool:
-    """Return whether frames of this bitstream can be decoded, which are those of 2.5 and newer."""
+    """Return whether frames of this bitstream can be decoded: it must be 2.5 or newer."""
     return version >= OLDEST
 
 

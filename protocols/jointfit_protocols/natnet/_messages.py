@@ -1,6 +1,6 @@
 """NatNet messages on UDP: connection, description of the server, clock echoes.
 
-    | u16 id | u16 payload length | payload |      little-endian; length = the datagram's - 4
+    | u16 id | u16 payload length | payload |      little-endian; length = size of the datagram - 4
 
 `decode` accepts datagrams of both directions, because a capture contains both. In addition, a
 simulator decodes the datagrams of a driver.

@@ -19,7 +19,7 @@ _LARGEST = 4 << 20
 _LONGEST_NAME = 255
 _MOST_DIGITS = 10
 _DECLARATIONS = ("<!DOCTYPE", "<!ENTITY")
-"""Declarations that QTM settings never contain, and with which a document could grow."""
+"""Declarations that QTM settings never contain. Entities could expand to a text of any size."""
 
 
 class QtmBody(NamedTuple):

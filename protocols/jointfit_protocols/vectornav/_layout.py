@@ -63,7 +63,8 @@ _GNSS = ("8s", "Q", "H", "B", "B", "3d", "3d", "3f", "3f", "3f", "f", "I", "2s",
 _ATTITUDE = ("H", "3f", "4f", "9f", "3f", "3f", "3f", "3f", "3f", "12s", "28s", "24s", "3f", "f")
 _INS = ("H", "3d", "3d", "3f", "3f", "3f", "3f", "3f", "3f", "f", "f", "68s", "64s")
 _MORE_GNSS = {17: "2s", 18: "8s"}
-"""Status and altitude; satellites (14) and raw measurements (16) have variable sizes."""
+"""Struct codes of the fields status (17) and altitude (18). The fields satellites (14) and raw
+measurements (16) have variable sizes."""
 _FORMATS: dict[int, dict[int, str]] = {
     0: dict(enumerate(_COMMON)),
     1: dict(enumerate(_TIME)),

@@ -30,9 +30,9 @@ from jointfit_protocols.corrupt import CorruptBytes
 DEFAULT_PORT = 3883
 """Default TCP and UDP port of servers."""
 MAJOR = 7
+"""Major version that both sides must share; a different minor version is compatible."""
 MINOR = 38
 """Newest minor version whose messages are supported."""
-"""Version that both sides must share; a different minor version is compatible."""
 MAX_MESSAGE = 64_000
 """Largest size of a message, bytes, which is the buffer size of the reference implementation."""
 MAX_IDS = 2000
@@ -191,7 +191,6 @@ def decode_announcement(datagram: bytes) -> Announcement | CorruptBytes:
 
     In the same way as the reference implementation, the function rejects ports below 1024, and
     hosts with characters other than letters, digits and dots.
-    than letters, digits and dots.
     """
     found = _ANNOUNCED.fullmatch(datagram)
     if found is None:

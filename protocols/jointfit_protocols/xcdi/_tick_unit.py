@@ -1,8 +1,8 @@
 """Unit of the SampleTime of an XCDI device, determined from the data.
 
-MT1604P states microseconds, and the vendor's current pages state ticks of 100 us. The rate is
-therefore near 10^6 or 10^4 ticks per second. These differ by a factor of 100, which a wrong nominal
-rate cannot explain.
+The vendor's document MT1604P (2019) states microseconds for SampleTime, and the vendor's current
+web pages state ticks of 100 us. The rate is therefore near 10^6 or 10^4 ticks per second. These
+rates differ by a factor of 100, which a wrong nominal rate cannot explain.
 
 The first estimate uses no arrival times. It is the number of ticks per sample, from SampleTime and
 GroupCounter, times the configured sample rate. Arrival times are not used because frames that were

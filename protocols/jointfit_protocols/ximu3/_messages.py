@@ -33,7 +33,7 @@ MULTIPLEXER = 0x5E
 OBJECT = 0x7B
 """First byte of a command or reply, which is an opening brace."""
 MOST_CHANNELS = 3
-"""Largest number of multiplexers in series. More are treated as corrupt."""
+"""Largest number of multiplexers in series. A message that passed more is treated as corrupt."""
 _BINARY = 0x80
 _HEAD = struct.Struct("<BQ")
 _TICKS = 1 << 64
@@ -183,7 +183,6 @@ def parse_rest(rest: bytes, end: int) -> XImu3Data | XImu3Reply | None:
     The rules are stricter than those of `parse_line`, in order to prevent accidental matches. Text
     and multiplexers are rejected, and the time must be plausible. An object must have no blank
     before its key. Otherwise the search of a line of braces would also be slow.
-    the search of a line of braces slow.
     """
     if rest[0] == OBJECT:
         if not rest.startswith(b'{"'):
@@ -225,7 +224,7 @@ def _parse_data(plain: bytes, size: int, end: int, channel: int | None) -> Line:
 
 
 def _unknown_binary(plain: bytes) -> MessageFault:
-    """Return the reason for a binary line without known layout; it may name newer firmware."""
+    """Return the reason for a binary line of unknown layout, which newer firmware may send."""
     letter, values = plain[0] ^ _BINARY, (len(plain) - _HEAD.size - 1) / 4
     plausible = values >= 1 and values.is_integer()
     if plausible and letter in _LETTERS and _HEAD.unpack_from(plain)[1] < _PLAUSIBLE_TICKS:
@@ -289,7 +288,9 @@ def _refuse_constant(name: str) -> NoReturn:
 
 
 def encode_command(key: str, value: object = None) -> bytes:
-    """Return a command or reply on the wire. A command without a value reads a value or acts.
+    """Return a command or reply on the wire.
+
+    A command without a value reads a setting or starts an action.
 
     Raises
     ------

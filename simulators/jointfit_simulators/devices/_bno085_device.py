@@ -2,7 +2,7 @@
 
 Invariants: in mode UART-RVC, the device sends from power-up and ignores the host. In mode
 UART-SHTP, the device sends an advertisement after a reset. It sends a report only after the host
-has set its interval. A reset clears the intervals.
+has set the interval of this report. A reset clears the intervals.
 """
 
 from __future__ import annotations

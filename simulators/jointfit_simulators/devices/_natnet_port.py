@@ -1,6 +1,6 @@
 """UDP socket of a simulated NatNet server.
 
-Invariant: it is bound to the loopback interface only.
+Invariant: the socket is bound to the loopback interface only.
 """
 
 from __future__ import annotations

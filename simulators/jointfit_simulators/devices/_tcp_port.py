@@ -1,4 +1,4 @@
-"""TCP port of a simulated server. Invariant: it is bound to the loopback interface only."""
+"""TCP port of a simulated server. Invariant: the port is bound to the loopback interface only."""
 
 from __future__ import annotations
 

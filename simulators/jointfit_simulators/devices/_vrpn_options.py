@@ -37,8 +37,8 @@ class VrpnServerOptions:
     spread_us: int = 20
     """Time between successive messages of one frame, µs."""
     described_late: bool = False
-    """Whether the description of a tracker precedes its first pose. Otherwise, it is sent after
-    connection."""
+    """Whether the description of a tracker is sent immediately before its first pose. Otherwise, it
+    is sent after connection."""
     answers_ping: bool = True
     velocities: bool = False
     """Whether a velocity follows every pose."""

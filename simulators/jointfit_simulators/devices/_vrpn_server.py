@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from jointfit_simulators.devices._natnet_port import Address
 
 _FIRST_SENDER, _FIRST_TYPE = 3, 11
-"""First numbers of trackers and types. In real servers, the connection uses the numbers before."""
+"""First numbers of trackers and types. In real servers, the connection uses the smaller numbers."""
 _CONTROL = "VRPN Control"
 _MOST_DATAGRAM = 1472
 _I32_MAX = b"\x7f\xff\xff\xff"

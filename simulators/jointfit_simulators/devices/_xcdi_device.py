@@ -1,4 +1,4 @@
-"""Virtual Xsens MTi-600 on CAN, which sends XCDI message groups on a shared wire, with faults.
+"""Virtual Xsens MTi-600 on a shared CAN bus: sends XCDI messages, and simulates faults on request.
 
 Invariant: clock and group counter continue while the host does not receive.
 """

@@ -232,7 +232,7 @@ def test_the_quaternion_is_found_without_a_reply_that_names_the_outputs(
         found = fed(under_test, wires)
         for sample, q in zip(samples(found), wanted, strict=True):
             assert sample.q_native == pytest.approx(q, abs=1.0 / unit if unit > 1 else 1e-6)
-        (text,) = (one for one in texts(found, "info") if "by their norm" in one)
+        (text,) = (one for one in texts(found, "info") if "used as the quaternion" in one)
         assert f"values {before + 1} to {before + 4} of {before + 4 + behind}" in text
         assert not texts(found, "warning")
 

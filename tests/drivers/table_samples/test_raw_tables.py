@@ -129,7 +129,7 @@ def test_readings_of_one_instant_and_saturated_ones_are_noticed() -> None:
         line = encode_line(wire, [0, 0, 500.0 if number > 110 else 0, 0, 0, 1, 0, 1, 0, micros])
         out += decoder.feed(Chunk((1 + number) * PERIOD_NS, line))
     assert [item.reason for item in out if isinstance(item, Corrupt)] == [
-        "raw measurements out of range, or of the same instant"
+        "raw measurements out of range, or with the time of the previous ones"
     ]
     assert any("out of range: heading is uncertain" in getattr(item, "text", "") for item in out)
 
