@@ -41,8 +41,8 @@ from jointfit_daemon.calibration.phases._static_pose import (
 from jointfit_daemon.calibration.phases._training_set import MIN_FRAMES, MISALIGNED, limb_training
 from jointfit_daemon.calibration.record import trials_digest
 from jointfit_daemon.calibration.registration import (
+    BODY,
     NO_LAG,
-    SKIN,
     SensorLag,
     fit_sensor_alignment,
     segment_lags,
@@ -252,7 +252,7 @@ def _lags(
     for segment, group in zip(chain.segments, chain.sensors, strict=True):
         track = tracks[segment]
         unknown = {s: functional.sensors[s] for s in group if s not in known}
-        out |= sensor_lags(track.t_ns, track.q, unknown, SKIN)
+        out |= sensor_lags(track.t_ns, track.q, unknown, BODY)
     return out
 
 

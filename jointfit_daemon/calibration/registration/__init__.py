@@ -1,8 +1,8 @@
 """Sensor-to-segment and world-to-world registration, stillness, lags and resampling."""
 
 from jointfit_daemon.calibration.registration._lags import (
+    BODY,
     NO_LAG,
-    SKIN,
     SensorLag,
     segment_lags,
     sensor_lags,
@@ -25,8 +25,8 @@ from jointfit_daemon.calibration.registration._static_mean import (
 from jointfit_daemon.calibration.registration._stillness import StillnessMonitor
 
 __all__ = [
+    "BODY",
     "NO_LAG",
-    "SKIN",
     "RobustMean",
     "SensorLag",
     "StaticLimits",

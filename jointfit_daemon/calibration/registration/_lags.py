@@ -41,9 +41,9 @@ PLATE = LagSettings(
 """Limits of the lag estimate on a rigid plate, where only noise and occlusion cause errors. The
 defaults of `LagSettings` are the limits for live tracking.
 """
-SKIN = replace(PLATE, max_sigma_ns=5e6, min_r2=0.7, min_weight=0.5)
-"""Limits of the lag estimate on skin, where R² is lower. An error of 5 ms at 3 rad/s is still below
-1°.
+BODY = replace(PLATE, max_sigma_ns=5e6, min_r2=0.7, min_weight=0.5)
+"""Limits of the lag estimate on the body, where soft tissue lowers R². An error of 5 ms at 3 rad/s
+is still below 1°.
 """
 
 SENSOR_TISSUE_SD_NS = 2e6

@@ -2,7 +2,7 @@ r"""Lag of an IMU behind motion capture, estimated from angular rates.
 
 The estimate needs no world frame, heading, gravity or sensor-to-segment alignment, so it precedes
 all other fits. The lag has a standard deviation, and is rejected if the data do not determine the
-lag.
+lag. The conditions are in ``_gate``; only a failed search is rejected here, in `coarse_lags`.
 
 Two rigidly connected bodies have the same angular rate up to a constant rotation and a gyro bias,
 
@@ -17,7 +17,7 @@ observe: constant transport delay, filters in both systems, and exposure convent
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import inf, nan, radians
+from math import inf, nan
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,12 +25,12 @@ import numpy as np
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.rotation_scalar import IDENTITY_ONE, as_quaternion
 from jointfit_daemon.timing.lag._angular_rates import (
-    BRIDGE_S,
     Interpolant,
     low_pass,
     rates_from_orientations,
 )
 from jointfit_daemon.timing.lag._fine_fit import LEAST_PAIRS, fit_lag
+from jointfit_daemon.timing.lag._gate import STAY_IN_VIEW, LagSettings, fit_fault, motion_fault
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -42,8 +42,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.lag._fine_fit import LagFit
 
 NO_OVERLAP = "the tracks do not overlap"
-STAY = "stay in view of the cameras"
-IRREGULAR = "move faster and irregularly, about several axes"
 _NYQUIST_SHARE = 0.4
 """Largest cut-off frequency as a fraction of the lower sample rate."""
 _LEAST_OVERLAP = 0.5
@@ -62,47 +60,6 @@ _RIVAL = 1.5
 """Ratio of residual variances below which two solutions cannot be distinguished."""
 _AGREE = 0.005
 """Relative difference of the rates that two correct systems measure."""
-
-
-@dataclass(frozen=True, slots=True)
-class LagSettings:
-    """Search range of the lag, and the thresholds that an estimate must pass.
-
-    The defaults are for live tracking. ``calibration.registration`` has other thresholds for the
-    plate and the body. `LagTracker` has the thresholds for a step of the lag.
-    """
-
-    span_s: float = 0.15
-    """Largest lag in the search, s; use 3 s if a clock is not mapped to host time."""
-    step_s: float = 0.004
-    cutoff_hz: float = 10.0
-    """Low-pass cut-off for both rates, Hz; at most 0.4 of the lower sample rate."""
-    bridge_s: float = BRIDGE_S
-    stamp_sd_ns: float = 144_000.0
-    """Standard deviation of the sawtooth error of the timestamps, ns. The default is a tick of 0.5
-    ms divided by sqrt(12). Use 0 if the timestamps are exact.
-    """
-    min_rate: float = radians(30.0)
-    """Least RMS angular rate of the reference, rad/s."""
-    min_acceleration: float = radians(300.0)
-    """Least RMS angular acceleration of the reference, rad/s²."""
-    max_sigma_ns: float = 700_000.0
-    """Largest standard deviation, ns. The threshold is well above the standard deviation of
-    ordinary motion, so that windows are not selected by chance.
-    """
-    min_r2: float = 0.98
-    """Least R². Correct data on one rigid body reach 0.998; sensors on soft tissue reach less."""
-    low_r2: str = (
-        "different motions or a wrong convention; check that the sensor is on this body and "
-        "attached firmly"
-    )
-    """Likely cause of a smaller R², and its remedy."""
-    min_weight: float = 0.7
-    """Least mean Huber weight. Below this value the fit depends on a minority of the data."""
-    min_valid: float = 0.8
-    """Least fraction of the window without gaps."""
-    max_bias: float = radians(10.0)
-    """Largest rate bias, rad/s. A larger bias indicates wrong units or a wrong stream."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,19 +168,15 @@ def estimate_in_steps(
     yield
     ref = low_pass(ref, cutoff)
     if min(imu.t_s.size, ref.t_s.size) < LEAST_PAIRS:
-        refused = f"no gapless stretch of data: {STAY}"
+        refused = f"no gapless stretch of data: {STAY_IN_VIEW}"
         return LagEstimate(nan, inf, nan, refused, valid_share=valid)
 
     rate, acceleration = _rms(ref.w), _rms(Interpolant(ref).slopes)
     seen = LagEstimate(
         nan, inf, nan, None, rate_rms=rate, acceleration_rms=acceleration, valid_share=valid
     )
-    if rate < settings.min_rate or acceleration < settings.min_acceleration:
-        refused = (
-            f"too little motion: {np.degrees(rate):.1f} deg/s rms, {np.degrees(acceleration):.0f} "
-            f"deg/s² rms; at least {np.degrees(settings.min_rate):.0f} and "
-            f"{np.degrees(settings.min_acceleration):.0f} are needed: {IRREGULAR}"
-        )
+    refused = motion_fault(rate, acceleration, settings)
+    if refused is not None:
         return replace(seen, refused=refused)
     yield
 
@@ -255,11 +208,7 @@ def _select_fit(seen: LagEstimate, fits: list[LagFit], settings: LagSettings) ->
         pairs=fit.pairs,
     )
 
-    refused = _gate(estimate, fit, settings)
-    if refused is None and rival is not None:
-        other = 1e3 * rival.tau_s
-        refused = f"the motion is periodic: a lag of {other:.0f} ms fits as well; {IRREGULAR}"
-    return replace(estimate, refused=refused)
+    return replace(estimate, refused=fit_fault(fit, rival, seen.valid_share, settings))
 
 
 def _best_and_rival(fits: list[LagFit], seen: LagEstimate) -> tuple[LagFit, LagFit | None]:
@@ -281,45 +230,6 @@ def _best_and_rival(fits: list[LagFit], seen: LagEstimate) -> tuple[LagFit, LagF
     return nearest, min(
         others, key=lambda fit: (round(1e3 * abs(fit.tau_s - nearest.tau_s)), fit.tau_s < 0.0)
     )
-
-
-def _gate(estimate: LagEstimate, fit: LagFit, settings: LagSettings) -> str | None:
-    """Return the message of the first threshold of `settings` that the estimate fails, or None."""
-    share, bias = estimate.valid_share, float(np.degrees(np.linalg.norm(fit.bias)))
-    gates = (
-        (
-            share >= settings.min_valid,
-            f"too many gaps: {100 * share:.0f} % of the time is covered, at least "
-            f"{100 * settings.min_valid:.0f} % are needed: {STAY}",
-        ),
-        (fit.converged, f"the fit did not converge: {IRREGULAR}"),
-        (
-            estimate.r2 >= settings.min_r2,
-            f"R² {estimate.r2:.3f} < {settings.min_r2:g}: {settings.low_r2}",
-        ),
-        (
-            estimate.mean_weight >= settings.min_weight,
-            "too many outliers: check for swapped or occluded markers",
-        ),
-        (
-            bias <= float(np.degrees(settings.max_bias)),
-            f"rate bias too large, {bias:.1f} deg/s: check the unit of the rate",
-        ),
-        (
-            estimate.sigma_ns <= settings.max_sigma_ns,
-            f"too uncertain: {_ms(estimate.sigma_ns)} > {_ms(settings.max_sigma_ns)}: {IRREGULAR}",
-        ),
-        (
-            abs(fit.tau_s) <= settings.span_s,
-            f"{1e3 * fit.tau_s:.0f} ms is outside the searched span of {1e3 * settings.span_s:.0f} "
-            "ms: check that both clocks are mapped",
-        ),
-    )
-    return next((reason for passed, reason in gates if not passed), None)
-
-
-def _ms(value_ns: float) -> str:
-    return f"{value_ns * 1e-6:.2f} ms" if value_ns < inf else "only one moment determines it"
 
 
 def coarse_lags(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bench.subjects.recorded_knee import load
-from jointfit_daemon.calibration.registration import SKIN, SensorLag, segment_lags, tracked_lags
+from jointfit_daemon.calibration.registration import BODY, SensorLag, segment_lags, tracked_lags
 from jointfit_daemon.calibration.registration._lags import MARKER_TISSUE_SD_NS, SENSOR_TISSUE_SD_NS
 from jointfit_daemon.timing.lag import LagEstimate, estimate_lag
 
@@ -81,7 +81,7 @@ def test_lag_errors_on_recorded_skin_are_within_their_deviation(
     off = []
     for first, bone in ((0, trial.thigh), (2, trial.shank)):
         moving = {
-            f"S{k + 1}": estimate_lag(t_ns + 7_000_000, trial.sensors[k], t_ns, bone, SKIN)
+            f"S{k + 1}": estimate_lag(t_ns + 7_000_000, trial.sensors[k], t_ns, bone, BODY)
             for k in (first, first + 1)
         }
         for chosen in segment_lags(moving, {}).values():
