@@ -131,6 +131,19 @@ def test_private_modules_are_imported_within_their_package_only(family: str) -> 
     assert crossing == []
 
 
+UNIT_FACTOR = re.compile(r"^_?(NS|US|MS|MM|NS_PER_M?S|STANDARD_GRAVITY) = ", re.MULTILINE)
+
+
+def test_factors_of_unit_conversions_are_defined_once() -> None:
+    """Codecs have factors of their own, because they import the standard library alone."""
+    assert [
+        name_of(path)
+        for path in SHIPPED
+        if not name_of(path).startswith("protocols/")
+        if UNIT_FACTOR.search(path.read_text(encoding="utf-8"))
+    ] == []
+
+
 def test_every_driver_is_in_the_readme() -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     drivers = project()["entry-points"]["jointfit.drivers"]

@@ -77,6 +77,57 @@ def test_a_link_into_nothing_is_noticed(tmp_path: Path) -> None:
     assert broken_links(page) == ["#gone", "gone.md"]
 
 
+PLACE = re.compile(r"`([\w./-]+(?:/|\.(?:py|md|json|toml|yml|1)))`")
+
+
+def places_to_change() -> dict[str, list[Path]]:
+    """Return the files and folders in the rows of "Where to change what", by first cell.
+
+    A name without a folder is in the folder of the name before it; ``NAME`` stands for any name.
+    """
+    section = text_of(ROOT / "docs" / "architecture.md").split("## Where to change what")[1]
+    found: dict[str, list[Path]] = {}
+    for row in re.findall(r"^\| (?!change )(\S.*)", section.split("\n## ")[0], re.MULTILINE):
+        change, *cells = row.split(" | ")
+        folder = ROOT / "jointfit_daemon"
+        for name in PLACE.findall(re.sub(r"\]\([^)]*\)", "]", " ".join(cells))):
+            if "/" in name or (ROOT / name).exists():
+                top = (ROOT / name.split("/")[0]).exists()
+                path = ROOT / name if top else ROOT / "jointfit_daemon" / name
+            else:
+                path = folder / name
+                path = path if path.exists() else ROOT / "jointfit_daemon" / name
+            folder = path if name.endswith("/") else path.parent
+            found.setdefault(change, []).append(path)
+    return found
+
+
+def missing(path: Path) -> bool:
+    return not list(ROOT.glob(path.relative_to(ROOT).as_posix().replace("NAME", "*")))
+
+
+def test_every_place_of_a_change_exists() -> None:
+    places = places_to_change()
+    assert sum(map(len, places.values())) > 100
+    gone = {
+        change: [str(p.relative_to(ROOT)) for p in paths if missing(p)]
+        for change, paths in places.items()
+    }
+    assert {change: paths for change, paths in gone.items() if paths} == {}
+
+
+CHANGES_ASKED_FOR = (
+    "driver", "MQTT topic", "calibration method", "lag gate", "command", "joint type",
+    "key of a payload", "configuration key", "detection of stuck sensors", "sink",
+)  # fmt: skip
+"""Changes whose place new contributors look for; each is in the first cell of a row."""
+
+
+@pytest.mark.parametrize("change", CHANGES_ASKED_FOR)
+def test_the_place_of_a_common_change_is_listed(change: str) -> None:
+    assert any(change in row for row in places_to_change())
+
+
 def whole_rigs(page: Path) -> list[str]:
     """Return the TOML blocks that are a rig by themselves."""
     return [body for body in blocks(page, "toml") if "[rig]" in body and "[[imu]]" in body]
@@ -93,6 +144,15 @@ def load(text: str) -> Rig:
 )
 def test_every_rig_in_the_pages_loads(page: Path, number: int) -> None:
     assert load(whole_rigs(page)[number]).sources
+
+
+def test_the_readme_begins_with_the_purpose_a_picture_a_message_and_a_comparison() -> None:
+    text = text_of(ROOT / "README.md")
+    purpose = text.split("![")[0].split("\n", 1)[1]
+    assert len(re.findall(r"\.(?=\s)", purpose)) == 3
+    marks = ("![Animation", "```json", "## Comparison", "make demo  ", "make demo ARGS=--web")
+    places = [text.index(mark) for mark in marks]
+    assert places == sorted(places)
 
 
 def test_the_readme_shows_a_rig() -> None:
