@@ -175,9 +175,9 @@ def estimate_in_steps(
     seen = LagEstimate(
         nan, inf, nan, None, rate_rms=rate, acceleration_rms=acceleration, valid_share=valid
     )
-    refused = motion_fault(rate, acceleration, settings)
-    if refused is not None:
-        return replace(seen, refused=refused)
+    too_little = motion_fault(rate, acceleration, settings)
+    if too_little is not None:
+        return replace(seen, refused=too_little)
     yield
 
     coarse, why = coarse_lags(imu, ref, settings)
