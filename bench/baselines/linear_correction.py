@@ -43,7 +43,7 @@ LARGEST = 0.4
 HULL = 10.0
 """Multiple of the 0.995 quantile of the training leverage above which the correction fades."""
 OUTSIDE = 3.0
-"""Multiple of this quantile above which the frame has the flag ``extrapolating``."""
+"""Multiple of the same quantile above which a frame has the flag ``extrapolating``."""
 
 
 @dataclass(frozen=True)

@@ -127,8 +127,7 @@ def _moving_spread(samples: ArrayLike, size: int) -> NDArray[np.float64]:
 def _moving_mean(values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
     """Return the means of `size` rows centered at each row; the end rows are repeated.
 
-    Running sums replace a scipy filter, because importing scipy would double the start time of the
-    daemon.
+    The means are computed from running sums.
     """
     before = size // 2
     padded = np.pad(values, ((before + 1, size - 1 - before), (0, 0)), mode="edge")

@@ -21,7 +21,8 @@ EXCITATION = 1e-3
 increase P.
 """
 IDLE_SAMPLES = 100
-"""Number of such samples of which one is used in any case: about one per second at 100 Hz."""
+"""Number of successive samples below `EXCITATION` of which one is used in any case. At 100 Hz,
+about one sample per second is used."""
 SYMMETRIZE_EVERY = 1000
 
 

@@ -1,9 +1,9 @@
 """Viewers of the dashboard: `python -m bench.rigs.dashboard_viewers PORT BASE COUNT`.
 
 Invariant: each viewer subscribes to the topics of the page through the tunnel of the dashboard's
-server, like a browser, and reads every message. The process prints a line when all viewers have
-received poses. It ends when its input is closed. It then prints the smallest number of bytes that a
-viewer has received since.
+server, like a browser, and reads every message. The process prints the line ``ready`` when all
+viewers have received poses. When its input is closed, it prints the smallest number of bytes that a
+viewer has received since ``ready``, and ends.
 """
 
 from __future__ import annotations

@@ -46,7 +46,8 @@ class RestartRun(NamedTuple):
         ]
 
     def unexcused_ns(self, source: str) -> list[int]:
-        """Return the part of these errors that delays of a loaded machine do not explain, ns."""
+        """Return the part of a source's errors that delays of a loaded machine do not explain,
+        ns."""
         return [
             unexcused(sample.error_ns, sample.excused_ns)
             for sample in self.core.samples

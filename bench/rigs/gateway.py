@@ -69,8 +69,8 @@ class ReceivedMessages:
     pose: dict[str, Any] = field(default_factory=dict)
     first_pose_s: float | None = None
     running_s: float | None = None
-    """Monotonic time of the message ``online`` on ``bridge/state``, s. `first_pose_s` is the time
-    of the first pose."""
+    """Monotonic time of the message ``online`` on ``bridge/state``, s. `first_pose_s` is the
+    monotonic time of the first pose."""
 
     async def listen(self, client: MqttClient) -> None:
         async for topic, payload in client.messages():
@@ -109,8 +109,8 @@ class Figures:
     received: int
     running_s: float
     first_pose_s: float
-    """Time from the start of the process to the first pose, s. Another value is the time to
-    ``online`` at the broker."""
+    """Time from the start of the process to the first pose, s. `running_s` is the time from the
+    start to ``online`` at the broker."""
 
 
 @cache
@@ -178,7 +178,7 @@ async def run_flooded(folder: Path, port: int, load: Load) -> FloodFigures:
             sent = await flood
         heard.health.clear()
         async with asyncio.timeout(END_S):
-            while not heard.health:  # noqa: ASYNC110 - as in _last_health
+            while not heard.health:  # noqa: ASYNC110 - another task sets it
                 await asyncio.sleep(0.05)
         ignored = heard.health["link"]["ignored_requests"]
         return FloodFigures(quiet_ms, flooded_ms, quiet_cpu, flooded_cpu, seconds, sent, ignored)
@@ -262,7 +262,7 @@ async def _measure(
 async def _last_health(heard: ReceivedMessages) -> dict[str, Any]:
     """Wait for a health message with all sources offline, when no sample is in transit."""
     async with asyncio.timeout(END_S):
-        while any(  # noqa: ASYNC110 - it hangs on what a message says, not on its coming
+        while any(  # noqa: ASYNC110 - the content of a message is the condition
             device["online"] for device in heard.health["devices"].values()
         ):
             await asyncio.sleep(0.05)

@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 SOURCES = {"S1", "S2", "S3", "S4", "mocap"}
 SETTLE_S, STATIC_S = 3.0, 3.5
 BLEND_S = 1.0
-"""Duration of the interpolation from standing to the first frame of the trial, s. It has no optical
-bodies."""
+"""Duration of the interpolation from standing to the first frame of the trial, s. The cameras track
+no bodies during the interpolation."""
 POLL_S = 0.05
 SPARE_S = 1.0
 """Time by which a phase is longer than its motion, s. Late bytes arrive in this time, and the
@@ -104,7 +104,7 @@ class Gateway:
 
     async def connected(self, settle_s: float = SETTLE_S) -> None:
         async with asyncio.timeout(CONNECT_S):
-            while not self.online >= SOURCES:  # noqa: ASYNC110 - five facts
+            while not self.online >= SOURCES:  # noqa: ASYNC110 - five sources
                 await asyncio.sleep(0.05)
         await asyncio.sleep(settle_s)
 
@@ -212,7 +212,7 @@ async def walking(data: Path, folder: Path, port: int, method: Method) -> Played
     """Restart with the squat calibration in `folder`, and evaluate walking live."""
     files = _files(data, "walking1")
     async with gateway(folder, port, _options(files, WALKING_HZ, method)) as running:
-        await running.connected(2 * SETTLE_S)  # at this speed, 1 ms is half a degree
+        await running.connected(2 * SETTLE_S)  # 1 ms causes an error of half a degree
         await running.live("trial", 1.3)
     return _judged(running, data, files, method)
 

@@ -1,10 +1,10 @@
 """Errors of the daemon's stamps relative to the true sampling times.
 
 Invariant: the replay of the recording yields every stamp of the live run, and the simulator's
-sample log contains the true time of each sample. Their difference is the error, except for a
-constant that arrival times cannot reveal. If a stamp is based on arrivals, the true minimum delay
-of the transport replaces the assumed delay. With an active lag correction or sync edges, nothing is
-replaced.
+sample log contains the true time of each sample. The error is the stamp minus the true time, except
+for a constant that arrival times cannot reveal. If a stamp is based on arrivals, the true minimum
+delay of the transport replaces the assumed delay. With an active lag correction or sync edges,
+nothing is replaced.
 
 On a loaded machine, samples arrive later. Without a fast sample, no clock can estimate the delay.
 The part of an error with this cause is reported separately (`excused_ns`). It is the additional

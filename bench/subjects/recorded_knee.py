@@ -1,5 +1,4 @@
-"""Knee with recorded soft-tissue artefact and filter errors on four virtual sensors, and a bone
-model.
+"""Recorded knee: soft-tissue artefact and filter errors of four virtual sensors, and a bone model.
 
 The module loads `semireal_knee4imu` in the conventions of the project, and computes errors like the
 tables of that data set.

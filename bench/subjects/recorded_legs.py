@@ -3,7 +3,7 @@ references.
 
 The module loads `semireal_knee4imu_v2`. Its two references are solutions of the same model, with
 fitted markers and with markers from the static trial. They differ by up to 20 deg about the long
-axis of the thigh. If only one reference shows an improvement, the improvement is on the error of
+axis of the thigh. If only one reference shows an improvement, the method may only fit the error of
 that reference.
 """
 

@@ -3,9 +3,9 @@
 The data set of the recorded knee contains the right leg without sit-to-stand. These trials are made
 from the marker files of its subject in the same way. The orientation of a sensor is the Kabsch
 rotation of three neighbouring skin markers relative to their mean in the static trial. The recorded
-filter error in the same movement is added (in squats for sit-to-stand). The reference is the
-subject's model, whose pose is from the inverse kinematics of this project, without any marker of
-the thigh and shank clusters.
+filter error of the same movement is added; for sit-to-stand, the filter error of the squats is
+used. The reference is the subject's model, whose pose is from the inverse kinematics of this
+project, without any marker of the thigh and shank clusters.
 
 Invariant: no marker of a sensor contributes to its reference. All alignments are from the static
 trial.

@@ -33,7 +33,8 @@ EXPECTED = {"α–σ": (0.98, 0.81), "r–σ": (1.00, 0.99), "r–α": (0.96, 0.
 """Correlations from an independent implementation, at the clipping limit that is nearest to the
 publication."""
 LARGE_RADIUS_M = 0.07
-"""Radius above which it has little influence with a noise of 5 mm, m."""
+"""Radius of the marker, m, above which the radius has little influence on the error (noise 5
+mm)."""
 
 
 @cache

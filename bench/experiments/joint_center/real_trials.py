@@ -2,7 +2,7 @@
 
 The thresholds are much larger than the measured values, so they detect regressions only. Along the
 axis of a hinge, the center is undetermined. The skin of the thigh slides over the femur in every
-step. The results of both have no threshold.
+step. Results that depend on one of these two effects have no threshold.
 """
 
 from __future__ import annotations

@@ -54,7 +54,8 @@ NOISE = 1e-3
 
 
 AT_20, AT_45 = (2.15, 2.15, 2.28, 3.26, inf), (0.85, 0.85, 0.91, 1.00, inf)
-"""Results of other authors for these methods, mm. The last method is not recommended."""
+"""Results of other authors for the five methods of `ball_joint`, in its order, mm. The last method
+is not recommended."""
 
 
 def rms(errors: list[Array]) -> float:
@@ -109,7 +110,7 @@ def frame_by_frame(_: Path) -> list[Result]:
 
 
 def ball_joint(rom: float, goals: tuple[float, ...], runs: int = 200) -> list[Result]:
-    """Two bodies with a noise of 1 mm on all markers; upper 95 % limits from 1000 runs on.
+    """Two bodies with a noise of 1 mm on all markers; upper 95 % limits for 1000 or more runs.
 
     Results of fewer than 200 runs vary by chance, and the tolerance allows for this variation.
     """

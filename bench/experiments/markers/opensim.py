@@ -130,7 +130,7 @@ def walking_alone(data: Path) -> list[Result]:
 
 
 def _to_the_end(subject: OpensimSubject, found: Refinement) -> list[Result]:
-    """OpenSim's result for walking at an accuracy that does not stop it early."""
+    """Errors of OpenSim for walking, with an accuracy that does not stop its tool early."""
     walk = subject.judged["walking1"]
     before = judge(subject.model, walk, accuracy=CONVERGED).rms
     after = judge(subject.model, walk, found.model, CONVERGED).rms

@@ -275,8 +275,8 @@ def truth(data: Path, count: int = 8) -> list[Result]:
 def feet_let_go(data: Path, count: int = 32) -> list[Result]:
     """Heels and toes are also displaced and free, so the foot's rotation is undetermined.
 
-    The results include an ideal case: learned from noise-free movements, with a prior that only
-    selects among equally good markers.
+    The results include an ideal case. In this case, the markers are learned from noise-free
+    movements, with a prior that only selects among equally good markers.
     """
     model, truly = oc4_lower(data), _moved(data)
     shares = []

@@ -104,8 +104,8 @@ def _shtp_peer() -> Callable[[], object]:
 
     def read() -> None:
         for _ in range(N):
-            reader._handle_packet(reader._read_packet())  # noqa: SLF001 - nothing public reads one
-        (found,) = reader._readings.values()  # noqa: SLF001 - neither returns it
+            reader._handle_packet(reader._read_packet())  # noqa: SLF001 - no public function
+        (found,) = reader._readings.values()  # noqa: SLF001 - no public access
         assert [round(part, 3) for part in found] == [0.0, 0.0, 0.6, 0.8]
 
     return read
@@ -114,7 +114,7 @@ def _shtp_peer() -> Callable[[], object]:
 def _in_turns(
     own: Callable[[], Callable[[], object]], peer: Callable[[], Callable[[], object]], quick: bool
 ) -> tuple[float, float]:
-    """Return the peer's CPU time per message, us, and the ratio of our time to it."""
+    """Return the package's CPU time per message, us, and the ratio of our time to that time."""
     ours: list[float] = []
     theirs: list[float] = []
     for _ in range(repeats(quick)):

@@ -95,7 +95,7 @@ def rows(quick: bool) -> list[Result]:
 
     ours: list[float] = []
     theirs: list[float] = []
-    for _ in range(repeats(quick)):  # in turns
+    for _ in range(repeats(quick)):  # both libraries alternate
         for prepare, took in ((_channels, ours), (_peer, theirs)):
             work = prepare()
             gc.collect()

@@ -93,7 +93,7 @@ def rows(quick: bool) -> list[Result]:
 
     ours: list[float] = []
     theirs: list[float] = []
-    for _ in range(repeats(quick)):  # in turns
+    for _ in range(repeats(quick)):  # both libraries alternate
         work = codec()
         stream.send()
         gc.collect()

@@ -1,8 +1,8 @@
 """MIP: codec and decoder per packet, compared with the vendor's library `pymscl`.
 
-The library reads a serial port in its own threads. Therefore, both read the same packets from a
-pseudo-terminal (pty) in turns, up to the numbers in all fields. The processor time of the whole
-process counts.
+The library reads a serial port in its own threads. Therefore, codec and library alternately read
+the same packets from a pseudo-terminal (pty), and convert all fields to numbers. The processor time
+of the whole process counts.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class _Line:
 
 
 def _read_ours(line: _Line, codec: mip.MipCodec) -> float:
-    """Return the processor time of one batch, from the port to numbers, s."""
+    """Return the processor time of one batch with our codec, from the port to numbers, s."""
     began = time.process_time()
     line.send()
     line.wait()
@@ -126,7 +126,7 @@ def _read_ours(line: _Line, codec: mip.MipCodec) -> float:
 
 
 def _read_theirs(line: _Line, node: Any) -> float:
-    """Return the processor time of one batch, from the port to numbers, s."""
+    """Return the processor time of one batch with pymscl, from the port to numbers, s."""
     began = time.process_time()
     line.send()
     values: list[object] = []
@@ -153,7 +153,7 @@ def rows(quick: bool) -> list[Result]:
     connection = package.Connection.Serial(other.path, 115_200)
     node = package.InertialNode(connection)
     try:
-        for _ in range(repeats(quick)):  # in turns
+        for _ in range(repeats(quick)):  # both libraries alternate
             codec = mip.MipCodec()
             gc.collect()
             ours.append(_read_ours(line, codec) / BATCH)

@@ -80,7 +80,7 @@ def own_rows(quick: bool) -> list[Result]:
 def rows(quick: bool) -> list[Result]:
     ours: list[float] = []
     theirs: list[float] = []
-    for _ in range(repeats(quick)):  # in turns
+    for _ in range(repeats(quick)):  # both libraries alternate
         for prepare, took in ((_codec, ours), (_peer, theirs)):
             work = prepare()
             gc.collect()

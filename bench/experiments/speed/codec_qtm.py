@@ -97,7 +97,7 @@ def qtm_rows(quick: bool) -> list[Result]:
     whole = _decoding("qtm", _qtm_settings(), QTM_FRAMES)
     ours: list[float] = []
     theirs: list[float] = []
-    for _ in range(repeats(quick)):  # in turns
+    for _ in range(repeats(quick)):  # both libraries alternate
         for prepare, took in ((_qtm_codec, ours), (_peer, theirs)):
             work = prepare()
             gc.collect()

@@ -85,7 +85,7 @@ def _peer() -> Callable[[], object]:
 def rows(quick: bool) -> list[Result]:
     ours: list[float] = []
     theirs: list[float] = []
-    for _ in range(repeats(quick)):  # in turns
+    for _ in range(repeats(quick)):  # both libraries alternate
         for prepare, took in ((_own_codec, ours), (_peer, theirs)):
             work = prepare()
             gc.collect()

@@ -112,7 +112,7 @@ def rows(quick: bool) -> list[Result]:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "messages.ximu3"
         file.write_bytes(TURNS * b"".join(MESSAGES))
-        for _ in range(repeats(quick)):  # in turns
+        for _ in range(repeats(quick)):  # both libraries alternate
             for took, measure in (
                 (ours, _ours_s),
                 (stored, partial(_theirs_s, live=False)),

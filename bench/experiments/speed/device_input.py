@@ -1,8 +1,8 @@
-"""CPU time per message that arrives on an event loop, for the daemon's readers and others.
+"""CPU time per message that arrives on an event loop, for readers of the daemon and of others.
 
 The messages are read from a pseudo-terminal (pty). Only one message is in transit at a time, so
 each message wakes the loop once. The receiver writes the next message, and the CPU time of writing
-is subtracted. The limit is a loop that only reads.
+is subtracted. The lower limit is the time of a loop that only reads.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ async def _serial_port(line: _Line, take: Take) -> AsyncIterator[None]:
 
 @contextlib.asynccontextmanager
 async def _pyserial_asyncio_fast(line: _Line, take: Take) -> AsyncIterator[None]:
-    import serial_asyncio_fast  # noqa: PLC0415 - a peer, not always installed
+    import serial_asyncio_fast  # noqa: PLC0415 - for comparison, may be missing
 
     class Receiver(asyncio.Protocol):
         @override
@@ -153,7 +153,7 @@ async def _shared_bus(line: _Line, take: Take) -> AsyncIterator[None]:
 @contextlib.asynccontextmanager
 async def _notifier(line: _Line, take: Take) -> AsyncIterator[None]:
     bus: Any = can.Bus(interface="slcan", channel=line.path, sleep_after_open=0)
-    notifier = can.Notifier(  # noqa: TID251 - the peer
+    notifier = can.Notifier(  # noqa: TID251 - for comparison
         bus, [lambda _: take()], loop=asyncio.get_running_loop()
     )
     try:
@@ -174,7 +174,7 @@ async def _measure(messages: list[bytes], reader: Reader) -> float:
 
 
 def _fast_loop() -> asyncio.AbstractEventLoop:
-    import uvloop  # noqa: PLC0415 - a peer, not always installed
+    import uvloop  # noqa: PLC0415 - for comparison, may be missing
 
     loop: asyncio.AbstractEventLoop = uvloop.new_event_loop()
     return loop
@@ -185,7 +185,7 @@ def _rows(
 ) -> list[Result]:
     """Return the times of all readers, and the ratios of the first reader (ours) to the others."""
     times: dict[str, list[float]] = {reader: [] for reader in readers}
-    for _ in range(QUICK_ROUNDS if quick else ROUNDS):  # in turns
+    for _ in range(QUICK_ROUNDS if quick else ROUNDS):  # all readers alternate
         for reader, read in readers.items():
             loop = _fast_loop if reader.endswith(UVLOOP) else asyncio.new_event_loop
             with asyncio.Runner(loop_factory=loop) as runner:

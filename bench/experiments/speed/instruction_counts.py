@@ -49,7 +49,7 @@ def count_instructions(work: Callable[[], object]) -> int:
     """Return the number of instructions that `work` executes in functions of the project."""
     count = 0
 
-    def trace(frame: FrameType, event: str, argument: Any) -> Any:  # noqa: ARG001 - of settrace
+    def trace(frame: FrameType, event: str, argument: Any) -> Any:  # noqa: ARG001 - for settrace
         nonlocal count
         if event == "call":
             if not frame.f_code.co_filename.startswith(ROOT):

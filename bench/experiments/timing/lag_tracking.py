@@ -25,7 +25,8 @@ START = 7_000 * S
 MICROSECONDS = TickClock(1000, None)
 SERVER = TickClock(100, None)
 LEAST_MS = 2.0
-"""Delay of the sensor's transport, ms. The clock model cannot detect it, so it is the lag."""
+"""Delay of the sensor's transport, ms. The clock model cannot detect this delay, so it appears as
+the lag."""
 CHAIN = Chain(("hip", "knee"), ("thigh",), (("S1",),))
 LAYOUT = MocapLayout((), ("thigh",))
 CALIBRATION = Calibration(

@@ -31,8 +31,8 @@ def _arrivals(_: Path) -> list[Result]:
 
 
 async def _live() -> RestartRun:
-    from bench.rigs.device_restarts import live  # noqa: PLC0415 - a rig needs packages other rows do without
-    from tests.broker_fixture import chosen_broker  # noqa: PLC0415 - so do brokers
+    from bench.rigs.device_restarts import live  # noqa: PLC0415 - needs further packages
+    from tests.broker_fixture import chosen_broker  # noqa: PLC0415 - needs further packages
 
     with tempfile.TemporaryDirectory() as folder:
         broker = chosen_broker()(Path(folder))
