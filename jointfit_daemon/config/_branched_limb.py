@@ -86,10 +86,11 @@ def _roots(table: ChainTable) -> list[str]:
 
 
 def check_branches(table: ChainTable) -> list[Fault]:
-    """Check that the joints connect all segments to one tree; keys with faults are None.
+    """Check that the joints connect all segments to one tree.
 
-    Later checks require that the earlier ones passed. The result therefore contains only the first
-    group of faults.
+    In `table`, a key whose value could not be read is None. Each check requires that the checks
+    before it found no fault. The result contains the faults of keys for limbs without branches,
+    and the faults of the first check that found any.
     """
     given = {"joints": table.joints, "proximal": table.proximal, "distal": table.distal}
     given["side"] = "left" if table.side == "left" else None
@@ -112,7 +113,7 @@ def _check_names(table: ChainTable) -> Iterator[Fault]:
     for name, times in Counter(joint.name for joint in table.joint).items():
         parents = [joint.parent for joint in table.joint if joint.name == name]
         if times > 1:
-            text = f"has {times} parents ({_join(parents)}), expected one [[chain.joint]] with it"
+            text = f"{times} tables have this name (parents: {_join(parents)}), expected one"
             yield Fault(_KEY, text, name)
     for joint in table.joint:
         key = f"{_KEY}[{joint.name}]"
@@ -138,7 +139,7 @@ def _check_connection(table: ChainTable) -> Iterator[Fault]:
     used = {name for joint in table.joint for name in (joint.parent, joint.child)}
     roots = _roots(table)
     for segment in (name for name in table.segments if name not in used):
-        text = f"is in no [[chain.joint]]: add the joint that connects {segment!r}, or remove it"
+        text = "is in no [[chain.joint]]: add a joint that connects this segment, or remove it"
         yield Fault("chain.segments", text, segment)
     connected = [name for name in roots if name in used]
     if len(connected) > 1:

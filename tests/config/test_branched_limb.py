@@ -73,7 +73,7 @@ def test_a_branched_rig_describes_no_line(legs: Table) -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({4: {"name": "right_knee"}}, "chain.joint = 'right_knee': has 2 parents (right_thigh, "),
+        ({4: {"name": "right_knee"}}, "chain.joint = 'right_knee': 2 tables have this name (par"),
         ({4: {"child": "right_shank"}}, "'right_shank': is the child of 'right_knee' already"),
         ({3: {"parent": "left_shank"}}, "form a cycle: left_thigh – left_shank – left_thigh;"),
         ({3: {"child": "left_thihg"}}, "have no proximal joint: pelvis, left_thigh; expected one"),

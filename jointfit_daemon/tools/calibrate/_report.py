@@ -147,4 +147,4 @@ def _error_line(quantity: str, by_method: Mapping[str, Any], method: str) -> str
     error = "error unknown" if error_deg is None else f"error {error_deg:.1f}°"
     if mean_deg is None or method == "mean":
         return f"{quantity} {error}"
-    return f"{quantity} {error}; sensor mean {mean_deg:.1f}°"
+    return f"{quantity} {error}; error of the sensor mean {mean_deg:.1f}°"

@@ -1,7 +1,8 @@
 """Terminal display of the demo: calibration progress, then joint angles with the ground truth.
 
-Invariant: the display fits into 80 columns and 24 lines. On a terminal the display is redrawn;
-other outputs receive one line per step.
+Invariant: the display fits into 80 columns and 24 lines. Without ``--headless`` the display is
+redrawn. With it, standard error receives one line per step, and one line per joint after the
+functional step.
 """
 
 from __future__ import annotations

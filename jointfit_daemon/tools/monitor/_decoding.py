@@ -52,7 +52,7 @@ def _validate(model: type[BaseModel], topic: str, payload: Any) -> BaseModel:
     if version != PAYLOAD_VERSION:
         raise UnreadablePayloadError(
             f"{topic}: payload version {version!r:.20}, this program reads {PAYLOAD_VERSION}:"
-            " install the version of the daemon"
+            " install the version of jointfitd that runs on the gateway"
         )
     payload = _printable(payload, topic)
     try:

@@ -67,7 +67,7 @@ def sources_section(results: SessionResults) -> str:
     legend = [("data", "data"), ("gap", "no data")]
     if any(len(gait.cycles_s) for gait in results.gait.values()):
         legend.append(("walking", "walking"))
-    text = "Lost: share of the expected samples between the first and the last one that is missing."
+    text = "Lost: missing samples as a share of those expected from the first to the last sample."
     return section(
         "recorded",
         "Recorded data",
@@ -122,8 +122,8 @@ def _timeline(results: SessionResults, width: float, kind: str) -> str:
         if x + 3.0 >= free_px and x + 7.0 * len(label) < width:
             parts.append(svg_text("tick", x + 3.0, 12.0, label, "start"))
             free_px = x + 7.0 * len(label) + 10.0
-    label = "; ".join(f"{title(name)}: {_gap_text(q)} gaps" for name, q in results.sources.items())
-    return image(width, height, f"Timeline. {label}", parts, kind)
+    gaps = "; ".join(f"{title(name)}: {_gap_text(q)}" for name, q in results.sources.items())
+    return image(width, height, f"Timeline. Gaps of the sources: {gaps}", parts, kind)
 
 
 def _extent(results: SessionResults, name: str) -> tuple[float, float]:
@@ -160,8 +160,9 @@ def timing_section(results: SessionResults) -> str:
         parts.append(table("Clocks", head, rows))
         parts.append(
             paragraph(
-                "Uncertainty: standard deviation of the instant of a sample. Jitter: scatter of the"
-                " arrival times. Skew: rate of the device clock against the gateway.",
+                "Uncertainty: standard deviation of the instant of a sample. Jitter: mean delay of"
+                " the samples beyond the smallest delay. Skew: rate error of the device clock,"
+                " positive if it is slower than the clock of the gateway.",
                 "note",
             )
         )

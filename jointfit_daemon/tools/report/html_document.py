@@ -25,7 +25,7 @@ class Drawing(str):
 
 
 class PageLink(str):
-    """Text that refers to another page; `address` is relative to this page."""
+    """Text that links to another page; `address` is relative to the page with the link."""
 
     __slots__ = ("address",)
 
@@ -87,7 +87,7 @@ def facts(pairs: Iterable[tuple[str, str]], kind: str = "facts") -> str:
 
 
 def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]], text: int = 1) -> str:
-    """Return a table with row names in the first column; `text` columns are left-aligned."""
+    """Return a table with row names in column 1; the first `text` columns are left-aligned."""
 
     def cell(number: int, value: str) -> str:
         kind = "" if number < text else ' class="number"'

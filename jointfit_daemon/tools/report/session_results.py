@@ -107,7 +107,7 @@ def analyze_session(session: SessionData) -> SessionResults:
 
 
 def is_fault(event: TimelineEvent) -> bool:
-    """Return whether an event reports a fault, which follows from its level or missing data."""
+    """Return whether an event reports a fault: it is a warning, an error or a gap in the data."""
     return event.data.get("level") in FAULT_LEVELS or event.kind == "gap"
 
 

@@ -111,7 +111,7 @@ def test_report_contains_errors_centers_and_missing_align_phase() -> None:
         }
     )
     assert lines == [
-        "thigh: orientation error 2.1°; sensor mean 4.1°",
+        "thigh: orientation error 2.1°; error of the sensor mean 4.1°",
         "knee: flexion error unknown",
         "hip: center from markers, sd 11 mm",
         "knee: center from markers by oriented, sd 24 mm, axis ± 0.5°",
