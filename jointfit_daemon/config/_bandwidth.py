@@ -110,7 +110,7 @@ def least_load(settings: Any, unknown: Iterable[str]) -> Any:
 
 
 def _choices(field: FieldInfo) -> list[Any]:
-    """Return all values of a key that has few values.
+    """Return all values of a Boolean or a choice, or the default of an inner table; else none.
 
     Identifiers count as one value, because they do not change the load.
     """
@@ -139,7 +139,7 @@ def _load(settings: Any) -> float:
 
 
 def check_serial_lines(sources: Sequence[Source]) -> Iterator[Fault]:
-    """Check every sensor on a separate serial line."""
+    """Check every sensor that has its own serial line."""
     for source in sources:
         needed = getattr(source.settings, "serial_bits_per_s", None)
         baud = getattr(source.settings, "baud", None)

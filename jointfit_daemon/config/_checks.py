@@ -70,7 +70,7 @@ def without_control_characters(value: Any) -> Any:
 
 
 def imu_name(imu: Mapping[str, Any], number: int) -> str:
-    """Return the name of an ``[[imu]]`` table in messages: its id, or its `number` without id."""
+    """Return the name of an ``[[imu]]`` table for messages: its id, or else its `number`."""
     name = imu.get("id")
     return name.replace("\0", "") if isinstance(name, str) and name else f"#{number}"
 
@@ -161,7 +161,7 @@ def check_durations(table: CalibrationTable) -> Iterator[Fault]:
     """Check that ``functional_s`` is at least ``functional_min_s``; wrong keys are None."""
     longest, shortest = table.functional_s, table.functional_min_s
     if None not in (longest, shortest) and longest < shortest:
-        text = f"is shorter than functional_min_s = {shortest:g}: lengthen it, or shorten that one"
+        text = f"is shorter than functional_min_s = {shortest:g}: increase it, or decrease that key"
         yield Fault("calibration.functional_s", text, longest)
 
 

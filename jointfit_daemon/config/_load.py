@@ -133,7 +133,7 @@ class _RigReader:
         self.imus_read: list[Source] = []
         """All IMUs whose tables are readable, including tables with faults."""
         self.imus_with_load: list[Source] = []
-        """IMUs of `imus_read` with a known bit rate: at most names in their tables are wrong."""
+        """IMUs of `imus_read` whose load is known. Wrong choices count with the smallest load."""
         for key in table:
             if key not in SECTIONS:
                 known = f"unknown table; known: {', '.join(SECTIONS)}"

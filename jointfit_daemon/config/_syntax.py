@@ -212,7 +212,7 @@ class _Repair:
             header = _WHOLE_HEADER.fullmatch(self.lines[at].strip())
             if header and header[1] == "imu" and not self.lines[at].strip().startswith("[["):
                 self.lines[at] = "[[imu]]"
-                self._report(at, "one table of several: write [[imu]]")
+                self._report(at, "[imu] is a single table: write [[imu]]")
 
     def _merge_tables(self, table: dict[str, Any]) -> dict[str, Any]:
         """Return the table, with keys of repeated tables moved into the first of these tables."""

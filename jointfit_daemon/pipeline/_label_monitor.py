@@ -95,7 +95,7 @@ class LabelMonitor:
         self.faults: dict[LabelFault, frozenset[str]] = {}
         """Current faults. The markers of the listed body parts must be visible to end a fault."""
         self.misfits: frozenset[str] = frozenset()
-        """Body parts whose markers do not fit, and for which no fault is an explanation."""
+        """Body parts whose markers do not fit, although no fault in `faults` explains this."""
 
     def serves(self, chain: Chain, calibration: Calibration) -> bool:
         """Return whether a new monitor with these arguments would be equivalent to this monitor."""

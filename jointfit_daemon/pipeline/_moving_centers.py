@@ -35,8 +35,10 @@ In one hour with a time constant of 20 s, 180 independent estimates are tested."
 _UNSEEN_SD_M = 1.0
 """Standard deviation along an unobserved direction, m; it exceeds the size of any limb."""
 _SAME_DIRECTION = 0.3
-"""Singular value below which the directions that the two centers did not observe are the same
-direction."""
+"""Largest singular value of a direction that counts as observed.
+
+The singular values belong to the matrix of the directions that either center did not observe. If
+both did not observe nearly the same direction, one singular value is large and the other small."""
 
 
 class MovingCenters:

@@ -84,7 +84,7 @@ class OpticalComparison:
         self._limb = OpticalLimb(chain, calibration) if usable and calibration else None
         self._signs = [flexion_sign(joint) for joint in chain.joints]
         self._conventions = [angle_convention(chain, i) for i in range(len(chain.joints))]
-        self._rate = RateDivider(rate_hz if usable else 1.0)  # unused if not usable
+        self._rate = RateDivider(rate_hz if usable else 1.0)  # 1.0: any valid rate, never used
         self._waiting: deque[tuple[int, int, bool, OpticalReading]] = deque(maxlen=_WAITING)
         """Instant, frame number, whether the stamp is synchronized, and the limb in the frame."""
         self._states: deque[LimbState] = deque(maxlen=_STATES)
@@ -170,7 +170,7 @@ class OpticalComparison:
 
         sign, left = self._signs[number], is_left(self._chain, number)
         measured = read_joint(proximal, distal, flexion_sign=sign, left=left, convention=convention)
-        if optical.gimbal or measured.gimbal:  # the angles are not comparable one by one
+        if optical.gimbal or measured.gimbal:  # in gimbal lock, single angles are not comparable
             return joint
         pairs = zip(measured.angles, optical.angles, strict=True)
         residual = JointAngles(*((a - b + pi) % (2.0 * pi) - pi for a, b in pairs))

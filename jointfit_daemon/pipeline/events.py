@@ -323,7 +323,7 @@ class CancelJob:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationReady:
-    """A calibration that must be stored. The shell answers with ``CalibrationStored``."""
+    """A calibration that must be stored. The supervisor answers with `CalibrationStored`."""
 
     calibration: Calibration
     keep_date: bool = False

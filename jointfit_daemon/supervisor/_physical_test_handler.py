@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 ABANDONED_S = 30.0
 """Time without a request after which a test ends, s. A web page requests the state every second."""
 LONGEST_S = 300.0
-"""Longest duration of a test, s. The web page may stay open during a test."""
+"""Longest duration of a test, s. The limit also ends a test whose web page remains open."""
 OPEN_S = 20.0
 """Longest time from opening to the first orientation, s, including a search for the speed."""
 RUNNING_PHASES = ("align", "static", "functional", "fitting")
@@ -162,7 +162,7 @@ class PhysicalTestHandler:
         """Reopen the sensor, so that the test receives its replies to the driver."""
         self._stop()
         await self._daemon.restart_device(source.id)
-        self._stop()  # the restart causes events at the same time
+        self._stop()  # another request may have started a test during the restart
         self._running = RunningPhysicalTest(source)
         self._daemon.subscribe(self._running)
         self._too_late = asyncio.get_running_loop().call_later(OPEN_S, self._note_silence)

@@ -4,9 +4,9 @@ Invariant: the daemon ends only by cancellation or because of a bug.
 
     task             purpose                                           end
     core time        feeds ticks to the core                           never
-    source ID        runs one driver, with retries                     with the rig
-    mqtt             publishes the outbox, passes on requests          with its settings
-    ready            notifies systemd when every source is known       once notified
+    source ID        runs one driver, with retries                     when the source is removed
+    mqtt             publishes the outbox, passes on requests          when [mqtt] changes
+    ready            notifies systemd when every source is known       after the notification
     health           publishes health, resets the watchdog             never
     recording        writes the recording, in a thread                 never
     spool            writes and sends messages of an outage            never
@@ -143,7 +143,8 @@ class Daemon:
         self._overload = OverloadMonitor()
         self._recorder: Recorder | None = None
         self._state_fault: str | None = None
-        self._state_lock: int | None = None  # stays None if the folder was writable at the start
+        # None if the folder was writable at the start: this process has locked it already.
+        self._state_lock: int | None = None
         self._calibration: CalibrationStatus | None = None
         self._health_due_s = 0.0
         self._reload_requested = asyncio.Event()
@@ -440,7 +441,7 @@ class Daemon:
         while True:
             await self._reload_requested.wait()
             self._reload_requested.clear()
-            with suppress(ConfigError):  # the fault is reported
+            with suppress(ConfigError):  # `reload` has reported the fault
                 await self.reload()
 
     async def reload(self, before_move: Callable[[Rig], None] | None = None) -> Rig | None:

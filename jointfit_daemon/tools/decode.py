@@ -190,7 +190,7 @@ def _why_nothing_found(file: Path, driver: type[Driver], name: str) -> str:
     if driver.wire == "can":
         sizes = frame_sizes(b"".join(chunk.data for chunk in chunks))
         shown = ", ".join(f"{number:#x}" for number, _ in sorted(sizes)[:MOST_SHOWN])
-        text += f" in its frames with {len(sizes)} identifiers ({shown or 'none'})"
+        text += f" in frames with {len(sizes)} identifiers ({shown or 'none'})"
         others = list(decode_frames(sizes, chunks))
     elif driver.wire == "stream":
         text += f" in {sum(len(chunk.data) for chunk in chunks)} bytes"

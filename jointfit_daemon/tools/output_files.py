@@ -18,7 +18,7 @@ PLOTS = (".png", ".svg", ".pdf")
 
 
 def check_output(option: str, path: Path | None, endings: Sequence[str]) -> None:
-    """Check that `path` can be written; accept None, which is a missing option.
+    """Check that `path` can be written; None, which means that the option is absent, is valid.
 
     Raises
     ------

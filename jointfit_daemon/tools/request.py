@@ -23,12 +23,12 @@ def request(
     name: Annotated[
         str,
         typer.Argument(
-            help="Request, as selftest; the documentation has a table.",
+            help="Request, such as selftest; the documentation has a table.",
             autocompletion=complete_request,
         ),
     ],
     arguments: Annotated[
-        str, typer.Argument(help='Its arguments as a JSON object, as {"device":"S1"}.')
+        str, typer.Argument(help='Its arguments as a JSON object, such as {"device":"S1"}.')
     ] = "{}",
     *,
     rig: _Rig = Path("rig.toml"),

@@ -54,7 +54,7 @@ def join_choices(names: Sequence[str]) -> str:
 
 
 def check_choice(option: str, value: str | None, choices: Sequence[str]) -> None:
-    """Check the value of an option; accept None, which is a missing option.
+    """Check the value of an option; None, which means that the option is absent, is valid.
 
     Raises
     ------

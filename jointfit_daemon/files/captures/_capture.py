@@ -9,7 +9,7 @@ The file type is determined from the first bytes, not from the name:
 | pcapng, pcap | stream | the segments of one direction of a TCP connection |
 | pcapng, pcap | can | one per classic CAN frame of a SocketCAN link |
 | ``candump`` text | can | one per line, a record of `jointfit_protocols.can_frame` |
-| raw bytes | stream | pieces of 4096 bytes; the time is that of 921 600 baud |
+| raw bytes | stream | 4096 bytes each; the times are computed for 921 600 baud |
 | raw bytes | datagram, split | packets |
 | raw bytes | datagram | messages ``u16 id, u16 length, …`` that fit exactly, else one datagram |
 | raw bytes | can | consecutive records of `jointfit_protocols.can_frame` |

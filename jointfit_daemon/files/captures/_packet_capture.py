@@ -6,7 +6,7 @@ The reader supports little- and big-endian files, several sections and interface
 to nanosecond time stamps. It supports Ethernet (with VLAN tags), Linux cooked, loopback, raw IP and
 SocketCAN links, and IPv4 and IPv6 with reassembly of fragments. Everything else in the file is
 skipped. Time stamps are returned as in the file, in ns since 1970. A packet without time stamp has
-that of the packet before it.
+the time stamp of the packet before it.
 
 Source: draft-ietf-opsawg-pcapng; draft-ietf-opsawg-pcap; RFC 791; RFC 8200; RFC 9293.
 """

@@ -1,9 +1,9 @@
 """Conversion of TCP segments to a byte stream for each direction of a connection, and to packets.
 
 Each retransmitted segment is used once, and late segments are sorted into the stream. A capture may
-begin in the middle of a connection or lack segments. The bytes after such a hole begin a new run.
-Most servers begin a packet with a new segment, so the search for packets restarts at the next
-segment.
+begin in the middle of a connection or lack segments. The bytes after such a hole do not continue
+the bytes before it. Most servers begin a packet with a new segment, so the search for packets
+restarts at the next segment.
 
 Invariant: all functions are pure; at most `_MOST_WAITING` segments of a direction wait for an
 earlier one.

@@ -212,7 +212,7 @@ class _Tree:
         """Return the segments to keep. A root whose parent is omitted moves freely."""
         left = [name for name in self.segments if name not in keep]
         if left:
-            self.remarks.append(f"left out, no marker needs them: {', '.join(left)}")
+            self.remarks.append(f"omitted, because no marker needs them: {', '.join(left)}")
         found = []
         for name, segment in self.segments.items():
             if name in keep:

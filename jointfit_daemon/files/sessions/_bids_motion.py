@@ -347,7 +347,7 @@ def _read_motion(path: Path, width: int) -> Any:
 
 
 def _channel_of(row: Mapping[str, str]) -> StreamColumn | None:
-    """Return the column of a channel by its own description, or else its type; or None."""
+    """Return the column that the description of a channel names, or else its type; or None."""
     quantity, _, component = row.get("description", "").partition(" ")
     item = row.get("tracked_point", "")
     placement = row.get("placement", _MISSING)

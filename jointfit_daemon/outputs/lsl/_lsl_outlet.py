@@ -73,8 +73,8 @@ class LslOutlet:
             ) from missing
         except (RuntimeError, OSError) as missing:  # pylsl is installed without liblsl
             raise LslError(
-                "pylsl finds no library liblsl, which its packages contain for x86-64 only: install"
-                " liblsl (https://github.com/sccn/liblsl) and set PYLSL_LIB to its path"
+                "pylsl finds no library liblsl (packages of pylsl contain it for x86-64 only): "
+                "install liblsl (https://github.com/sccn/liblsl) and set PYLSL_LIB to its path"
             ) from missing
         self._lsl = pylsl
 

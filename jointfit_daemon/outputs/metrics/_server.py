@@ -143,7 +143,8 @@ def _server_of(host: str) -> type[WSGIServer]:
         @override
         def finish_request(self, request: Any, client_address: Any) -> None:
             """Answer one client, and end its connection at the time limit."""
-            limit = threading.Timer(_CLIENT_S, _end, (request,))  # also for slow clients
+            # A timeout of the socket would not end a client that sends or reads single bytes.
+            limit = threading.Timer(_CLIENT_S, _end, (request,))
             limit.daemon = True
             limit.start()
             try:

@@ -111,8 +111,9 @@ class Incoming:
 def stop_if_cancelled() -> None:
     """Raise a cancellation that ``wait_for`` in aiomqtt may have suppressed (Python 3.11).
 
-    ``wait_for`` prefers a result that arrives at the same instant. Call this function in leaf tasks
-    only. A task that contained a failed TaskGroup may appear cancelled from then on.
+    If a result arrives at the instant of the cancellation, ``wait_for`` returns the result. Call
+    this function only in tasks without TaskGroup, because a task that contained a failed TaskGroup
+    may appear cancelled from then on.
     """
     task = asyncio.current_task()
     if task is not None and task.cancelling():
@@ -308,7 +309,7 @@ class MqttConnection:
                 correlation=getattr(message.properties, "CorrelationData", None),
             )
 
-    # --- making one --------------------------------------------------------------------------
+    # --- creation of the client --------------------------------------------------------------
 
     async def _new_client(self) -> _Client:
         settings, will = self._settings, self._will

@@ -258,7 +258,7 @@ class MqttPublisher:
         if lasted_s > 0.0 and self._taken_over:
             reason = self._contested
         elif lasted_s > 0.0 and (CONNECTION_LOST in reason or CONNECTION_CLOSED in reason):
-            # It is accidental which operation fails first, and a takeover causes the same error.
+            # Which operation fails first is random, and a takeover causes the same error.
             reason = (
                 f"broker {self._settings.host}:{self._settings.tcp_port}: the connection ended "
                 "without a reason: the broker stopped, the network failed, or another client uses "

@@ -1,4 +1,4 @@
-"""Signatures of requests. Client and daemon share this module; shell tools can do the same.
+"""Signatures of requests, for client and daemon. Shell tools can compute the same signatures.
 
 A signed request has three additional keys::
 

@@ -129,7 +129,7 @@ class TopicWriter:
         self._announce(rig)
 
     def _announce(self, rig: Rig) -> None:
-        """Publish the discovery message for Home Assistant, or remove it if it is switched off."""
+        """Publish the discovery message for Home Assistant; remove it if discovery is off."""
         topic, settings = discovery_topic(rig.mqtt), rig.mqtt.home_assistant
         if self._discovery is not None and topic != self._discovery:
             self._outbox.retain(self._discovery, b"")

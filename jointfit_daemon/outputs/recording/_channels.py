@@ -4,7 +4,7 @@ channel         content                                              encoding
 source/ID       one chunk of a source, as it arrived                 bytes
 event/KIND      every other input event of the core                  JSON
 output/KIND     outputs of the core: `OUTPUT_KINDS`                  JSON
-daemon/KIND     health and notices of the daemon around the core     JSON
+daemon/KIND     health and notices of the daemon outside the core    JSON
 snapshot/KIND   events that restore the state at the start of a file or after a gap
 recording/gap   messages that could not be written to the disk
 """

@@ -286,7 +286,10 @@ class _Sequencer:
         """Most recent damaged range, which is the reason of the next gap."""
 
     def continues(self, item: RecordedMessage) -> bool:
-        """Count the next message and return True; return False for snapshots and after gaps."""
+        """Return whether a message follows the previous one without a gap; if so, count it.
+
+        The result is False for snapshots.
+        """
         if item.sequence != self._expected or _channel_parts(item.channel)[0] in _RESTORING:
             return False
         self._expected, self._t_ns, self._restoring = item.sequence + 1, item.t_ns, False
@@ -295,7 +298,7 @@ class _Sequencer:
     def follow(
         self, item: RecordedMessage | DamagedBlock | PartEnd
     ) -> Iterator[RecordedMessage | RecordingGap]:
-        """Yield the messages and gaps that follow from the next item of a file."""
+        """Process the next item of a file; yield its message and the gap before it, if any."""
         if isinstance(item, DamagedBlock):
             self.damage = f"bytes {item.start} to {item.end} are damaged: {item.reason}"
         elif isinstance(item, PartEnd):
@@ -305,7 +308,8 @@ class _Sequencer:
             if item.sequence > self._expected:
                 reason = self.damage
                 if item.channel == GAP:
-                    reason = ""  # from a gap in a file that was made by hand
+                    # A file that was edited by hand may contain a gap without a reason.
+                    reason = ""
                     with suppress(ValueError, KeyError, TypeError):
                         reason = str(orjson.loads(item.data)["reason"])
                 yield self._gap(item.sequence, item.t_ns, reason)
@@ -337,8 +341,8 @@ def open_recording(path: Path) -> Recording:
     Raises
     ------
     RecordingError
-        A file is not a recording, or was written by a later version. Or the folder contains no
-        recording, or several.
+        A file is not a recording, or was written by a later version; or the folder does not
+        contain exactly one recording.
     OSError
         A file cannot be read.
     """
@@ -416,7 +420,10 @@ def open_part(path: Path) -> RecordedPart:
 
 
 def _read_info(path: Path, values: dict[str, str]) -> RecordingInfo | None:
-    """Return the description of a file; None for a damaged copy, because there are two."""
+    """Return the description in a metadata record; None if it is damaged.
+
+    Every file contains a second copy of its description.
+    """
     try:
         version = int(unseal(values)["format"])
     except (ValueError, KeyError):

@@ -47,8 +47,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Output
 
 MOST_UNWRITTEN_BYTES = 16 * 1024 * 1024
-"""Largest number of bytes that wait while the disk is full, equal to minutes of four IMUs. Later
-messages are lost."""
+"""Largest number of bytes that wait while the disk is full, equal to several minutes of data of
+four IMUs. Later messages are lost."""
 RETRY_S = 1.0
 """Interval between attempts to create a file, s."""
 ABANDON_S = 5.0

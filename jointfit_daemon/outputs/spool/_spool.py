@@ -1,9 +1,9 @@
 """Delivery of events and decimated poses after the end of a broker outage, also after a restart.
 
 While the daemon is connected, only the messages of the last seconds are stored, in memory. They are
-needed because a loss of the connection is detected late, and messages sent before may not have
-arrived. During an outage, messages are written to disk. After the outage, they are sent in order,
-at least once, after all other messages.
+needed because a loss of the connection is detected late, and messages that were sent before the
+detection may not have arrived. During an outage, messages are written to disk. After the outage,
+they are sent in order, at least once, after all other messages.
 
 Invariant: `Spool.add` appends to a list of limited size and returns. Above a limit, the oldest
 messages are dropped and counted.

@@ -44,7 +44,8 @@ MAX_FRAMES = 3000
 MIN_FRAMES = 600
 """Number of frames required for a refit, equal to one minute of movement."""
 REFIT_NS = 180_000_000_000
-"""Shortest time between two refits, and from enough frames to the first refit, ns."""
+"""Shortest time between two refits, ns. The first refit waits for the same time after there are
+enough frames."""
 _FAULTS = {
     FrameFlag.STUCK: "sensor repeats its value",
     FrameFlag.SLIPPED: "sensor slipped",

@@ -364,10 +364,13 @@ def _orientations(
         new = rows[max(start, fitted) : start + _FRAMES_PER_STEP]
         if new:
             seen = np.stack([frame.markers for _, frame in new])
-            absent = np.full((len(seen), 1, 3), np.nan)  # column -1: not part of the stream
+            # Column -1 contains NaN for markers that are not part of the stream.
+            absent = np.full((len(seen), 1, 3), np.nan)
             positions = np.concatenate((seen, absent), axis=1).take(columns, axis=1)
             parts.append(rigid_fit(cluster.template, positions)[0])
-        yield  # also for frames of `before`, because results depend on the steps
+        # The generator also yields for frames of `before`, so that the number of steps, on which
+        # results depend, is the same without `before`.
+        yield
     return t_ns, np.concatenate(parts)
 
 

@@ -36,7 +36,9 @@ def write_summary(results: Sequence[RecordingResult], out: Path) -> list[Path]:
     states = [(name.title(), f"{count[name]}") for name in ("done", "differs", "failed")]
     pairs = [("Recordings", f"{len(ordered)}"), *states]
     cells = [_row(result, out) for result in ordered]
-    body = section("recordings", "Recordings", [table("One row a recording", _HEAD, cells, text=2)])
+    body = section(
+        "recordings", "Recordings", [table("One row per recording", _HEAD, cells, text=2)]
+    )
     header = f"<header><h1>Batch summary</h1>{facts(pairs, 'facts head')}</header>"
     page = document("Batch summary", f"{header}<main>{body}</main>")
 

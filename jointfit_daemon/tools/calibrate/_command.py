@@ -1,8 +1,8 @@
 """Command `jointfit calibrate`: requests calibration phases over MQTT and reports their result.
 
 Invariants: only the result is written to stdout; prompts, progress and warnings are written to
-stderr. If the broker and the daemon are reachable, a phase that this command started is aborted
-before the command ends.
+stderr. If this command is stopped during a phase that it started, it aborts the phase before it
+ends, provided that the broker and the daemon are reachable.
 """
 
 from __future__ import annotations
@@ -72,9 +72,7 @@ _Out = Annotated[
     Path | None,
     typer.Option(help="With --recording: write to this .json file instead of the store."),
 ]
-_Revert = Annotated[
-    bool, typer.Option("--revert", help="Use the newest version before the one in force again.")
-]
+_Revert = Annotated[bool, typer.Option("--revert", help="Use the version before the active one.")]
 
 
 class StandardInputClosedError(ValueError):
@@ -282,9 +280,6 @@ async def _abort_phase(
     If the phase ends before the daemon receives the abort, the final status is reported. If the
     daemon refused the request, a running phase belongs to another client and is not aborted. The
     abort request runs in its own task because the current task is already cancelled.
-
-    A refused request started no phase, so the running phase belongs to another client and is not
-    aborted. The request runs in its own task because the current task is already cancelled.
     """
     await asyncio.wait([request], timeout=ABORT_S)
     started = request.done() and not request.cancelled() and request.exception() is None

@@ -145,7 +145,9 @@ def _segments(
 ) -> list[list[str]]:
     """Return the markers of each segment; --parent and --markers are a chain of two."""
     if window is not None:
-        raise ValueError("--window is for one joint: omit it, or --segment and --trajectory")
+        raise ValueError(
+            "--window is for one joint: omit --window, or omit --segment and --trajectory"
+        )
     if segment and (parent or markers):
         raise ValueError("--segment names the whole chain: omit --parent and --markers")
     if segment:

@@ -1,8 +1,8 @@
 """Centres of rotation from a marker trial: parent frame, estimates by window, world positions.
 
-The parent frame is defined by the parent's markers. The origin is their mean, x extends from the
-first to the second marker, and z is normal to the plane of the first three. For planar movement, y
-is normal to x. The parent frame is therefore the same in all trials with the same marker placement.
+The parent frame is defined by the parent's markers, so it is the same in all trials with the same
+marker placement. Its origin is their mean, and x extends from the first to the second marker. In
+space, z is normal to the plane of the first three markers. For planar movement, y is normal to x.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 
 
 CHI2_95 = {1: 3.841, 2: 5.991, 3: 7.815}
-"""95 % quantile of the chi-squared distribution, by degrees of freedom. It equals the ratio of the
-squared semi-axis to the variance."""
+"""95 % quantile of the chi-squared distribution, by degrees of freedom. The squared semi-axis of a
+95 % ellipsoid is this quantile times the variance along the semi-axis."""
 STILL_M = 0.005
 """RMS movement of the child markers, m, below which the centre is unobservable."""
 _SEGMENT_M = (0.005, 2.0)
 """Plausible extent of the markers of one segment, m; other values indicate a wrong unit."""
 LEAST_PLANAR = 2
-"""Number of parent markers that an estimate in a plane needs."""
+"""Smallest number of parent markers for an estimate in a plane."""
 _FEWEST_FRAMES = 3
 """Smallest number of frames of a window: three points define a circle."""
 _EXCHANGE_RAD = 2.5

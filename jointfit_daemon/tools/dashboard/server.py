@@ -78,7 +78,8 @@ class DashboardServer:
         ValueError
             The errors of `open_listener`.
         """
-        logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # malformed requests
+        # At lower levels, the library would log every malformed request with a traceback.
+        logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
         async with serve(
             self._serve_viewer,
             sock=open_listener(listen) if listener is None else listener,
@@ -111,7 +112,7 @@ class DashboardServer:
         return response
 
     def _refusal(self, request: Request, method: str) -> Response | None:
-        """Return the error response to a request that no path accepts; None for other requests."""
+        """Return the error response to an invalid request; None for a valid request."""
         host = request.headers.get_all("Host")
         if _path(request.path) is None or len(host) != 1:
             return self._text(HTTPStatus.BAD_REQUEST, "Expected a path and one Host header.")
@@ -284,7 +285,7 @@ def _url(listen: ListenAddress, server: Server, scheme: str) -> str:
 
 
 def own_address() -> str:
-    """Return the network address of this machine, or the loopback address without a network.
+    """Return the network address of this machine; without a network, the loopback address.
 
     No packet is sent, because connecting a UDP socket only selects the interface of the default
     route.

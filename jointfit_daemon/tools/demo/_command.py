@@ -56,13 +56,13 @@ def demo(
 ) -> None:
     """Run the daemon on simulated hardware; needs no device, broker or root access.
 
-    Starts a broker, two IMUs on pseudo-terminals, two on a CAN adapter (of an arm three each), a
-    motion-capture server and the daemon, calibrates, and compares the joint angles with ground
-    truth. Exits with 1 if a step fails or a target is missed: flexion error of the knee (elbow,
-    lumbar joint) 3 degrees RMS, all samples accounted for,
-    99 % of frames received within 60 ms. Ctrl-C, SIGTERM and SIGHUP stop the run and print the
-    results so far. With --web the limb is calibrated and then moves until the run is stopped, with
-    exit code 0; nothing is compared.
+    Starts a broker, a motion-capture server, the daemon and four IMUs: two on pseudo-terminals and
+    two on a CAN adapter (for an arm three each). Then it calibrates, and compares the joint angles
+    with ground truth. Exits with 1 if a step fails or a target is missed: flexion error of the knee
+    (elbow, lumbar joint) at most 3 degrees RMS, all samples accounted for, and 99 % of frames
+    received within 60 ms. Ctrl-C, SIGTERM and SIGHUP stop the run and print the results so far.
+    With --web the limb is calibrated and then moves until the run is stopped, with exit code 0;
+    nothing is compared.
     """
     if not (math.isfinite(seconds) and seconds > 0.0):
         raise ValueError(f"--seconds {seconds:g}: expected a finite number above 0")

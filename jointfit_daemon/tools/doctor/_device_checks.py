@@ -25,15 +25,15 @@ _LISTEN_S = 1.0
 _CONNECTION = {"id", "segment", "driver", "port", "baud", "transport", "silence_s"}
 """Keys of ``[[imu]]`` that do not affect decoding."""
 _SILENT = (
-    "silent, as a device that waits for a command: its family can be named only after the daemon "
-    "opened it"
+    "silent: probably a device that waits for a command; its family can be determined only after "
+    "the daemon has opened it"
 )
 
 
 def check_devices(host: Host, sources: Iterable[Source]) -> Iterator[Finding]:
     """Compare the data on serial ports with the configured drivers; yield the findings.
 
-    Another module reports missing ports, ports without permission, and ports in use.
+    `_serial_checks.py` reports missing ports, ports without permission, and ports in use.
 
     Parameters
     ----------

@@ -67,7 +67,7 @@ def _check_port(host: Host, path: str, ports: Sequence[SerialPortInfo]) -> Itera
             text = f"in use by {program} (process {number}), as while the daemon runs"
             yield Finding(CHECK, path, "note", text)
         else:
-            text = f"in use by {program} (process {number}), which takes bytes or blocks it"
+            text = f"in use by {program} (process {number}), which reads its bytes or locks it"
             yield Finding(CHECK, path, "error", text, f"close it: kill {number}")
     if name.startswith(_MODEM_PORTS) and _is_probed(host, name):
         yield Finding(

@@ -1,4 +1,4 @@
-"""Notes on the parts of a calibration that `jointfit fuse apply` ignores: lags and the side."""
+"""Notes on lags, which `jointfit fuse apply` ignores, and on the side, which a model lacks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LARGEST_LAG_DIFFERENCE_NS = 1_000_000
 def calibration_notes(
     calibration: Calibration, sensors: Collection[str], *, left: bool
 ) -> tuple[str, ...]:
-    """Return notes, with remedies, on quantities that fusion does not apply or the model lacks.
+    """Return notes, each with its remedy, on lags and on the side of the limb.
 
     Parameters
     ----------

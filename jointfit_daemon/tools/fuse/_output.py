@@ -1,6 +1,7 @@
 """Applies a model to recorded sensors; writes orientations, joint angles and joint positions.
 
-Invariant: the fusion of the daemon runs frame by frame, so the results equal those of a live rig.
+Invariant: the results equal those of a live rig, because the fusion of the daemon processes the
+trial frame by frame.
 """
 
 from __future__ import annotations
@@ -90,8 +91,8 @@ class FusedTrial:
     angles: Mapping[str, FusedAngles]
     """Angles of each joint between two segments, by joint."""
     positions: Mapping[str, FusedPosition]
-    """Positions of the joints, by joint. The list ends at the first segment of unknown length, and
-    is empty if the first length is unknown."""
+    """Positions of the joints, by joint, up to the first segment of unknown length. It is empty if
+    the first length is unknown."""
     flags: Mapping[str, float]
     """Share of frames with each flag, 0 to 1."""
     notes: tuple[str, ...] = ()
@@ -125,7 +126,7 @@ def chain_of(
 
 
 def fuse_trial(calibration: Calibration, table: OrientationRecording, chain: Chain) -> FusedTrial:
-    """Fuse recorded sensors frame by frame; a NaN orientation is a missing sensor.
+    """Fuse recorded sensors frame by frame; NaN means that a sensor has no data in a frame.
 
     Parameters
     ----------

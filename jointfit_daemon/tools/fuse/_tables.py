@@ -1,7 +1,7 @@
 """Reads orientation recordings (NPZ, STO) and checks units, order and sampling times.
 
 Invariants: returned orientations have z up. An implausible unit, component order or time raises
-`UnusableInputError`; the values are never corrected.
+`UnusableInputError`; values are never converted to another unit or order.
 """
 
 from __future__ import annotations

@@ -216,8 +216,9 @@ def read_static(
 ) -> tuple[dict[str, Array], StaticMarkers | None]:
     """Estimate sensor alignments from a static trial, and the marker positions on the segments.
 
-    With markers, or without a reference, segment axes equal world axes in the static pose. A JSON
-    file of alignments can replace the sensor file of the static trial.
+    If the reference consists of markers, or if the static trial has no reference, segment axes
+    equal world axes in the static pose. A JSON file of alignments can replace the sensor file of
+    the static trial.
 
     Raises
     ------

@@ -234,7 +234,7 @@ def _trial_solution(
     known = np.stack(whole, axis=1) & solved[:, None]
     table = coordinate_table(model, found.state, covariance, loaded.coordinates, known)
     notes += [
-        f"{segment}: rotates by up to {np.degrees(most):.1f}° outside of its coordinates"
+        f"{segment}: its coordinates cannot represent up to {np.degrees(most):.1f}° of its rotation"
         for segment, most in table.misfit.items()
         if most > _MISFIT_RAD
     ]
@@ -247,7 +247,7 @@ def _trial_solution(
         )
     never = [name for name, some in zip(table.names, ever, strict=True) if not some]
     if never:
-        notes.append(f"no markers determine, left out: {list_names(never)}")
+        notes.append(f"omitted, because no markers determine them: {list_names(never)}")
 
     tracked = seen.any(axis=0)
     return TrialSolution(

@@ -102,7 +102,7 @@ def chosen_settings(answers: Mapping[Key, Any], sensor: str) -> dict[str, str]:
 
 
 def settings_asked(answers: Mapping[Key, Any], found: Found) -> tuple[str, ...]:
-    """Return ``SENSOR.KEY`` for every required driver key that has few values."""
+    """Return ``SENSOR.KEY`` for every required driver key whose values the dialogue lists."""
     return tuple(
         f"{name}.{choice.key}"
         for name in sensors_of(answers)

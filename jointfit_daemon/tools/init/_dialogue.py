@@ -244,8 +244,8 @@ class Dialogue:
             if again is None or again.default is None:
                 listed = "; ".join(each.text for each in sensors)
                 raise AnswerError(
-                    f"no sensor is left that fits the driver and its settings, received: {listed}. "
-                    f"{BACK!r} returns to them"
+                    f"no unused sensor fits the driver and its settings; received: {listed}. "
+                    f"{BACK!r} returns to these settings"
                 )
             return
 

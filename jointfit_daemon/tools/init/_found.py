@@ -1,4 +1,7 @@
-"""Devices, drivers and names that were found on this machine, the second input of the engine."""
+"""Devices, drivers and names that were found on this machine.
+
+The functions of `_engine.py` receive them in addition to the answers.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ Wiring = Literal["serial", "can"]
 
 @dataclass(frozen=True, slots=True)
 class KeyChoice:
-    """A required driver key that has few values."""
+    """A required driver key whose possible values the dialogue lists."""
 
     key: str
     values: tuple[Any, ...]
@@ -69,7 +72,7 @@ class ImuDriver:
     text: str = ""
     """Description of the devices that the driver reads."""
     choices: tuple[KeyChoice, ...] = ()
-    """Required keys of the driver that have few values."""
+    """Required keys of the driver whose possible values the dialogue lists."""
     needs_layout: bool = False
     """Whether the user must describe the frames of the device in the ``[[imu]]`` table."""
     possible: tuple[CanSensor, ...] = ()

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 Kind = Literal["text", "names", "number", "yes_no", "choice", "device", "address", "ids"]
 """Type of the value that a question expects."""
 
-NEEDED = "an answer is needed here: '?' explains the question, Ctrl-C stores the others for later"
+NEEDED = "an answer is needed here: '?' explains the question, Ctrl-C stores the other answers"
 """Error message if the user types nothing and there is no proposal."""
 _YES, _NO = ("y", "yes", "true", "1"), ("n", "no", "false", "0")
 

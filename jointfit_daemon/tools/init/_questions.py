@@ -78,8 +78,7 @@ class Question:
     explain: Propose = _nothing
     """Function that returns the help text for one subject, or None if `help` applies."""
     is_of_keys: bool = False
-    """Whether the subjects are keys of the subjects of the group, such as ``S1.mode`` for ``S1``.
-    """
+    """Whether each subject is a key of a sensor in the group, such as ``S1.mode`` for ``S1``."""
 
 
 def _if(condition: Callable[[Given], bool]) -> Callable[[Given, Found], tuple[str, ...]]:
@@ -120,7 +119,7 @@ def _identifiers(answers: Given, found: Found, sensor: str) -> tuple[FoundDevice
 
 _IDS_HELP = (
     "Identifiers of the messages of this sensor. 'find' receives on a CAN interface and proposes"
-    " the identifiers of its sensors. 'later' leaves the place open until they are known."
+    " the identifiers of its sensors. Answer 'later' if they are not known yet."
 )
 
 QUESTIONS: tuple[Question, ...] = (
@@ -322,7 +321,7 @@ QUESTIONS: tuple[Question, ...] = (
         "address",
         "Computer of the motion-capture system",
         "Name or address of the computer that runs the camera software, with :PORT if its port is"
-        " not the usual one. 'later' leaves the place open.",
+        " not the usual one. Answer 'later' if it is not known yet.",
         postponable=True,
         subjects=_if(has_cameras),
         default=lambda _answers, found, _: next((s.address for s in found.servers), None),
@@ -334,8 +333,8 @@ QUESTIONS: tuple[Question, ...] = (
         "names",
         "Markers on the {subject}",
         "Names in the stream, separated by commas: at least three that are not on one line."
-        " 'find' reads the names from the stream. 'later' leaves the place open until they are"
-        " known. Body parts that are not segments may have none.",
+        " 'find' reads the names from the stream. Answer 'later' if they are not known yet. Body"
+        " parts that are not segments may have none.",
         postponable=True,
         subjects=lambda answers, _: marked_parts(answers),
         default=_proposals.markers,
@@ -346,8 +345,8 @@ QUESTIONS: tuple[Question, ...] = (
         "plate",
         "text",
         "Rigid body of the plate for the align phase",
-        "Name in the stream of the plate that carries all sensors once per laboratory. 'later'"
-        " leaves the place open until it is known.",
+        "Name in the stream of the plate that carries all sensors once per laboratory. Answer"
+        " 'later' if it is not known yet.",
         postponable=True,
         subjects=_if(lambda answers: _has_sensors(answers) and has_cameras(answers)),
         default=_proposals.plate,

@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.init._answers import Answers
 
 _DIALOGUE_KEYS = {"id", "segment", "driver", "port", "can", "ids", "fields", "server"}
-"""Required keys that the dialogue asks for, in addition to keys with few values. The dialogue does
-not offer a driver that has other required keys."""
+"""Required keys that the dialogue asks for. It also asks for required keys whose values it can
+list. The dialogue does not offer a driver that has other required keys."""
 _LAYOUT_KEYS = (
     "frame", "text", "ids", "extended_ids", "sequence", "dbc", "fields", "byte_order", "world",
     "direction", "orientation", "magnetometer",
@@ -258,7 +258,7 @@ class DeviceSearch:
     def stream_names(self, found: Found, host: str, port: int) -> tuple[Found, str]:
         """Return `found` with the marker names of a server's stream, and a text for the user."""
         if not self.network:
-            return found, f"{host} was not asked for its markers (--no-network)"
+            return found, f"{host} was not asked for its marker names, because of --no-network"
         try:
             servers = asyncio.run(
                 find_mocap_servers([host], port=port or None, wait_s=SERVER_WAIT_S)

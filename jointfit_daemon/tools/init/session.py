@@ -157,7 +157,7 @@ def _question(asked: Asked) -> dict[str, Any]:
     if question.kind == "yes_no":
         choices = [("yes", ""), ("no", "")]
     if question.postponable:
-        choices.append((LATER, "not known yet: leave this place open"))
+        choices.append((LATER, "not known yet: enter it later"))
     return {
         "name": asked.name,
         "text": asked.text,

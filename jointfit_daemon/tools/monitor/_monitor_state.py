@@ -87,7 +87,7 @@ class MonitorState:
     view: ViewName = "live"
     choice: AngleChoice | None = None
     turn_deg: int = 0
-    """Direction of view, degrees about the vertical from the view from the side."""
+    """Direction of view, degrees about the vertical; 0 is the view from the side."""
     cursor: int = 0
     """Index of the selected entry of the history or of the list of rigs."""
     scroll: int = 0
@@ -171,7 +171,7 @@ class MonitorState:
         return self.stored.versions[min(self.cursor, len(self.stored.versions) - 1)]
 
     def press(self, key: str) -> Action | None:
-        """Change the state as the key requires; return the action of the key, if it has one."""
+        """Process a key press; return the action that the program must execute, or None."""
         if key in {"q", "ctrl+c", "ctrl+q"}:
             return Quit()
         if key != "R":

@@ -102,7 +102,7 @@ def screen_lines(state: MonitorState, width: int, height: int, now: Moment) -> l
 
 
 def page_state(state: MonitorState, now: Moment) -> tuple[Level, str, str]:
-    """Return level and text of the overall state, and a banner text, empty without a fault."""
+    """Return level and text of the overall state, and the fault for the banner or an empty text."""
     rig = state.rig
     if state.link == "lost":
         return "error", "Broker lost", f"{state.reason}. Trying again."

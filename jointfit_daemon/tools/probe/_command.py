@@ -78,8 +78,8 @@ def probe(
     read at the usual speeds of the installed drivers until one of them decodes the data; layouts of
     serial-table and can-table in rig.toml are tried, too. Prints lines for rig.toml. With
     --physical-test it opens that sensor as the daemon does, guides through three rotations, and
-    prints the corrections. Exit codes: 0 everything named was recognized, or the frames are as
-    configured; 1 something was not, or they are not; 2 invalid options.
+    prints the corrections. Exit codes: 0 every named device was recognized, or the configured
+    frames are correct; 1 a device was not recognized, or the frames are wrong; 2 invalid options.
     """
     if physical_test is not None:
         if serial or can or mocap or network:

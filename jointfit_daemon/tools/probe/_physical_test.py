@@ -1,4 +1,4 @@
-"""Guided test of one sensor, in which three rotations by hand check the configured frames.
+"""Guided test of one sensor: three rotations by hand, which check the configured frames.
 
 The driver runs as in the daemon. `jointfit_daemon.physical_test` evaluates the chunks from the
 driver.

@@ -46,7 +46,7 @@ def report_lines(report: ProbeReport) -> Iterator[str]:
     """Yield the lines of text of a report."""
     yield "Serial ports"
     rows = [(port.path, port.device, port.description) for port in report.serial_ports]
-    yield _table(rows, "none: plug an adapter in, and look at `dmesg`")
+    yield _table(rows, "none: plug an adapter in, and read the kernel log (`dmesg`)")
 
     yield "\nCAN interfaces"
     rows = []

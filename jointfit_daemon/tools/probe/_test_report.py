@@ -15,6 +15,6 @@ if TYPE_CHECKING:
 def test_lines(result: PhysicalTestResult) -> Iterator[str]:
     """Yield the measured rotations, the outcome, and the changes to make in rig.toml."""
     for rotation, deviation in zip(ROTATIONS, result.deviations_deg, strict=True):
-        yield f"{rotation}: {deviation:.0f} deg from the rotation that was asked for"
+        yield f"{rotation}: {deviation:.0f} deg from the requested rotation"
     yield f"{result.id} sends: {result.found}"
     yield from correction_lines(result)

@@ -47,10 +47,10 @@ def replay(
         bool, typer.Option("--mqtt", help="Publish as the daemon does, below replay/BASE.")
     ] = False,
     base: Annotated[
-        str | None, typer.Option(help="Base topic of --mqtt. Default: replay/ and that of the rig.")
+        str | None, typer.Option(help="Base topic of --mqtt. Default: replay/ and the rig's own.")
     ] = None,
     broker: Annotated[
-        str | None, typer.Option(help="HOST or HOST:PORT for --mqtt. Default: that of the rig.")
+        str | None, typer.Option(help="HOST or HOST:PORT for --mqtt. Default: the rig's broker.")
     ] = None,
     rig: Annotated[
         Path | None, typer.Option(help="Process again with this rig.toml; fits are computed again.")
@@ -65,8 +65,8 @@ def replay(
 ) -> None:
     """Run a recording through the core again: print its time line, verify or publish it.
 
-    The recorded configuration gives the recorded outputs, byte for byte. Another rig or calibration
-    gives those that it would have had.
+    With the recorded configuration, the outputs equal the recorded outputs, byte for byte. With
+    another rig or calibration, they are the outputs that the daemon would have published with it.
 
     Exit codes: 0 success; 1 --verify found a difference or nothing to compare, or no broker; 2
     invalid options, recording, rig or calibration; 128 + N stopped by signal N.

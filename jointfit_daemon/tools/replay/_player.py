@@ -58,7 +58,7 @@ class PlaySummary:
     def text(self) -> str:
         """Return the summary as a sentence."""
         factor = self.seconds / self.took_s if self.took_s else math.inf
-        lost = f"; the broker did not take {self.dropped} messages" if self.dropped else ""
+        lost = f"; the broker did not accept {self.dropped} messages" if self.dropped else ""
         return (
             f"{self.rig}: {self.states} limb states from {self.events} events, "
             f"{self.settings}: {self.seconds:.1f} s in {self.took_s:.1f} s ({factor:.0f} × real "

@@ -190,7 +190,7 @@ def _range_text(values_deg: Array) -> str:
 
 
 def gait_section(results: SessionResults) -> str:
-    """Return mean and standard deviation of the angles over the gait cycle."""
+    """Return the section with the mean and standard deviation of the angles over a gait cycle."""
     if not results.gait:
         text = "Gait cycles need the orientation of a shank; the session has none."
         return section("gait", "Gait cycles", [paragraph(text)])
@@ -329,7 +329,7 @@ def _range_bar(found: MotionRange, limits: tuple[float, float]) -> Drawing:
 def comparison_section(results: SessionResults) -> str:
     """Return the section on the angle differences between sensors and cameras."""
     if not results.differences:
-        text = "There is no reference: the cameras saw no joint angle in this session."
+        text = "There is no reference: the cameras measured no joint angle in this session."
         return section("cameras", "Sensors against cameras", [paragraph(text)])
     rows = [
         (
@@ -360,8 +360,8 @@ def comparison_section(results: SessionResults) -> str:
             paragraph(
                 "Bias: mean difference. Limits of agreement: bias ± 1.96 standard deviations (Bland"
                 " and Altman 1986). Inside interval: share of the differences within the 95 %"
-                " interval that the sensors stated; 95 % is expected. Cameras have errors, too, of"
-                " soft tissue above all.",
+                " interval that the sensors stated; 95 % is expected. The angles from the cameras"
+                " have errors, too, mainly from soft tissue.",
                 "note",
             ),
         ],

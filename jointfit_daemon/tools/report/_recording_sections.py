@@ -171,8 +171,8 @@ def timing_section(results: SessionResults) -> str:
             facts(
                 [
                     ("Latency, median", f"{_value(latency, 'median_ms', 1.0, 1)} ms"),
-                    ("95 % of the frames below", f"{_value(latency, 'p95_ms', 1.0, 1)} ms"),
-                    ("Largest", f"{_value(latency, 'max_ms', 1.0, 1)} ms"),
+                    ("Latency, 95th percentile", f"{_value(latency, 'p95_ms', 1.0, 1)} ms"),
+                    ("Latency, largest", f"{_value(latency, 'max_ms', 1.0, 1)} ms"),
                 ]
             )
         )

@@ -152,7 +152,7 @@ def _gait_tile(results: SessionResults) -> tuple[str, str, str, bool]:
 
 def _camera_tile(results: SessionResults) -> tuple[str, str, str, bool]:
     if not results.differences:
-        return "Against the cameras", UNKNOWN, "the cameras gave no reference", False
+        return "Against the cameras", UNKNOWN, "the cameras measured no reference", False
     found = results.differences[0]
     name = joint_angle(found.joint, found.angle)
     return "Against the cameras", degree(found.rms), f"RMS of {name.lower()}", False

@@ -26,7 +26,7 @@ def schema(
 ) -> None:
     """Print a JSON Schema: of rig.toml, or of the payload of a topic or request.
 
-    Editors with a TOML language server use that of rig.toml to complete and check it.
+    Editors with a TOML language server use the schema of rig.toml to complete and check the file.
     """
     from jointfit_daemon.config import rig_schema
     from jointfit_daemon.tools.schema._asyncapi import asyncapi_document

@@ -22,7 +22,7 @@ export function createActions(store, request, showView) {
 const ACTIONS = {
   static: () => ({
     menu: "Record the static pose again…", title: "Record the static pose again", button: "Start standing", view: "calibrate",
-    text: "Stand upright and still, with straight joints. It corrects the headings of the sensors, for example after they were put on again. Poses continue meanwhile.",
+    text: "Stand upright and still, with straight joints. The new static pose corrects the headings of the sensors, for example after they were put on again. Poses continue meanwhile.",
     command: "static",
   }),
   mark: () => ({

@@ -1,4 +1,4 @@
-// Connection to the broker, which finds a rig, subscribes, reconnects, and reports the lost part.
+// Connection to the broker. It finds a rig, subscribes, reconnects, and reports what was lost.
 
 import mqtt from "../vendor/mqtt.esm.js";
 

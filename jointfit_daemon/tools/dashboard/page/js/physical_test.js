@@ -105,7 +105,7 @@ function showSteps(list, { state, step, steps }) {
 function outcomeOf({ device, rotations, result }) {
   const measured = createElement(
     "ul", { class: "test-rotations" },
-    ...rotations.map((name, index) => createElement("li", {}, `${name}: ${formatNumber(result.deviations_deg[index], 0, "°")} from the rotation that was asked for`)),
+    ...rotations.map((name, index) => createElement("li", {}, `${name}: ${formatNumber(result.deviations_deg[index], 0, "°")} from the requested rotation`)),
   );
   const found = createElement("p", {}, `${device} sends: ${result.found}`);
   if (result.agrees) return [measured, found];

@@ -88,7 +88,7 @@ export function createRecordingPanel(store, access, request, openAction) {
 /** Return the reason why the buttons are disabled; empty if they are enabled. */
 function disabledReason(store, access) {
   if (store.bridge === "lost") return "The page lost its connection: the state of the recording is unknown.";
-  if (store.bridge === "offline") return "jointfitd is not running. It completes a file that it was writing at its next start.";
+  if (store.bridge === "offline") return "jointfitd is not running. At its next start, it completes the file that it was writing.";
   if (store.bridge !== "online") return "Waiting for jointfitd.";
   if (access.mayRequest === false) return "This account can watch only: log in as an operator to record.";
   return "";
