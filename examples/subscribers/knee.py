@@ -1,7 +1,7 @@
 """Print the knee flexion ten times per second: python knee.py [HOST [PORT [BASE]]].
 
-The script needs `pip install aiomqtt`. BASE is the key base of [mqtt] in rig.toml; the default is
-jointfit/NAME.
+The script needs `pip install aiomqtt`. BASE is the value of `base` under [mqtt] in rig.toml; the
+default is jointfit/bench-1.
 """
 
 import asyncio
