@@ -13,12 +13,13 @@ from importlib.util import find_spec
 from math import inf
 from pathlib import Path
 from pkgutil import walk_packages
+from statistics import median
 from typing import TYPE_CHECKING
 
 from bench import experiments
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from bench.framework.material import Material
 
@@ -133,6 +134,25 @@ def near(
     """Return a result that must be within `tolerance` of `expected`."""
     maximum, minimum = round(expected + tolerance, 9), round(expected - tolerance, 9)
     return Result(name, value, maximum, minimum, unit, note=note)
+
+
+def median_and_worst(
+    name: str,
+    values: Sequence[float],
+    unit: str = "deg",
+    *,
+    maximum: float = inf,
+    worst_maximum: float | None = None,
+) -> list[Result]:
+    """Return median and worst of the values of several subjects or draws; large values are worse.
+
+    Both must be at most `maximum`, except that `worst_maximum` replaces it for the worst value.
+    """
+    worst = maximum if worst_maximum is None else worst_maximum
+    return [
+        Result(f"{name}, median", median(values), maximum, unit=unit),
+        Result(f"{name}, worst", max(values), worst, unit=unit),
+    ]
 
 
 def find_experiments(topic: str = "") -> list[Experiment]:

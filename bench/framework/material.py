@@ -13,20 +13,18 @@ class Material(NamedTuple):
 
 
 SEEDED = Material("none; random numbers with a fixed seed", "true values, known by construction")
-SIMULATED_SUBJECTS = Material(
-    "simulated subjects, one per random seed, with different sensor-to-segment alignment, heading, "
-    "soft-tissue artefact, markers and sensor errors",
-    "true bone orientations, not available to the estimators",
-)
 KNEE = Material(
     "1 adult (OpenCap subject 4), right leg, 4 virtual IMUs (orientations of skin-marker "
-    "clusters plus recorded errors of real orientation filters)",
+    "clusters plus recorded errors of real orientation filters, in one assignment to the sensors)",
     "musculoskeletal model fitted to other markers",
 )
 BOTH_KNEES = Material(
     "1 adult (OpenCap subject 4), both legs, 8 virtual IMUs (orientations of skin-marker "
-    "clusters plus recorded errors of real orientation filters)",
+    "clusters plus recorded errors of real orientation filters, in one assignment to the sensors)",
     "inverse kinematics of the subject's model without the markers of thighs and shanks",
+)
+EXCHANGED_KNEES = BOTH_KNEES._replace(
+    subjects=BOTH_KNEES.subjects.replace("one assignment", "five assignments")
 )
 BOARD = Material(
     "1 IMU on a rigid board without soft tissue (BROAD, trials 02 slow and 07 fast)",
@@ -64,3 +62,12 @@ RECORDED_LEGS = Material(
     "computed twice, with the fitted marker positions of the model and with the marker "
     "positions of the static trial",
 )
+
+
+def simulated_subjects(count: int) -> Material:
+    """Return the material of an experiment with `count` simulated subjects."""
+    return Material(
+        f"{count} simulated subjects, one per random seed, with different sensor-to-segment "
+        "alignment, heading, soft-tissue artefact, markers and sensor errors",
+        "true bone orientations, not available to the estimators",
+    )

@@ -19,7 +19,7 @@ from bench.experiments.fusion.recorded_movements import (
     flexion_scores,
 )
 from bench.framework.experiment import Experiment, Result
-from bench.framework.material import BOTH_KNEES
+from bench.framework.material import BOTH_KNEES, EXCHANGED_KNEES
 from bench.subjects.recorded_knee import FOLDER, Judge, training_frames
 from bench.subjects.skin_marker_knees import AS_RECORDED, MOVEMENTS, STATIC, SUBJECT, skin_knee
 from jointfit_daemon.kinematics import rotation
@@ -232,7 +232,7 @@ EXPERIMENTS = (
         "sit-to-stand-exchanged-filter-errors",
         "Errors in sit-to-stand with five assignments of the filter errors to the sensors",
         exchanged,
-        BOTH_KNEES,
+        EXCHANGED_KNEES,
         _DATA,
         known_misses={"right: flexion": EXCHANGED_FLEXION},
     ),

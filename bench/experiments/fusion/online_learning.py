@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.framework.experiment import Experiment, Result
-from bench.framework.material import SIMULATED_SUBJECTS
+from bench.framework.material import simulated_subjects
 from bench.subjects.faulty_wearer import SubjectRecording, play
 from bench.subjects.simulated_wearer import bench_rig
 from jointfit_daemon.calibration import (
@@ -344,21 +344,21 @@ EXPERIMENTS = (
         "online-learning-new-movements",
         "Errors before and after online learning of squats and sitting, calibrated on walking",
         online,
-        SIMULATED_SUBJECTS,
+        simulated_subjects(len(SEEDS)),
         long=True,
     ),
     Experiment(
         "online-learning-wrong-cameras",
         "Number of accepted refits from wrong optical references; all must be rejected",
         guarded,
-        SIMULATED_SUBJECTS,
+        simulated_subjects(len(SEEDS)),
         long=True,
     ),
     Experiment(
         "online-learning-redonning",
         REDONNED,
         redonned,
-        SIMULATED_SUBJECTS,
+        simulated_subjects(len(SEEDS)),
         long=True,
     ),
 )

@@ -17,11 +17,10 @@ from bench.experiments.fusion.simulated_leg import (
     Errors,
     errors_of,
     live_of,
-    spread,
     take_pose,
 )
-from bench.framework.experiment import Experiment, Result
-from bench.framework.material import SIMULATED_SUBJECTS
+from bench.framework.experiment import Experiment, Result, median_and_worst
+from bench.framework.material import simulated_subjects
 from bench.subjects.simulated_wearer import bench_rig, phases_of
 from jointfit_daemon.calibration.phases import fit_calibration, fit_plate_alignment
 from jointfit_daemon.units import MM_PER_M
@@ -90,7 +89,7 @@ def other_bodies(_: Path) -> list[Result]:
     errors, means = found["anchored"], found["mean"]
     figures = [Result("subjects accepted", len(errors), len(SEEDS), len(SEEDS) - 1, unit="")]
     for name in ("thigh", "shank"):
-        figures += spread(name, [getattr(each, name) for each in errors])
+        figures += median_and_worst(name, [getattr(each, name) for each in errors])
     median, of_mean = (float(np.median([e.knee for e in each])) for each in (errors, means))
     within = float(np.mean([each.within_2_sd for each in errors]))
     return [
@@ -99,7 +98,7 @@ def other_bodies(_: Path) -> list[Result]:
         Result("knee, worst", max(each.knee for each in errors), inf),
         Result("knee, median, method mean", of_mean, inf, minimum=median),
         Result("knee within 2 sd (ideal 0.95)", within, 1.0, minimum=0.9, unit=""),
-        *spread("error of a segment length", off_mm, "mm"),
+        *median_and_worst("error of a segment length", off_mm, "mm"),
     ]
 
 
@@ -109,7 +108,7 @@ EXPERIMENTS = (
         f"{len(SEEDS)} simulated subjects with other bone lengths, sensor orientations and "
         "soft-tissue artefact",
         other_bodies,
-        SIMULATED_SUBJECTS,
+        simulated_subjects(len(SEEDS)),
         long=True,
     ),
 )

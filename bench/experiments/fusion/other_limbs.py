@@ -15,7 +15,7 @@ import numpy as np
 
 from bench.experiments.fusion.simulated_leg import take_pose
 from bench.framework.experiment import Experiment, Result
-from bench.framework.material import SIMULATED_SUBJECTS
+from bench.framework.material import simulated_subjects
 from bench.subjects.simulated_wearer import bench_rig, phases
 from jointfit_daemon.calibration.phases import fit_calibration, fit_plate_alignment
 from jointfit_daemon.fusion import LimbFuser
@@ -153,7 +153,7 @@ EXPERIMENTS = tuple(
         f"simulated-{limb}",
         f"Live errors of {len(SEEDS)} simulated subjects: {what}",
         partial(spread, limb),
-        SIMULATED_SUBJECTS,
+        simulated_subjects(len(SEEDS)),
         long=True,
     )
     for limb, what in (

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.framework.experiment import Experiment, Result
-from bench.framework.material import SIMULATED_SUBJECTS
+from bench.framework.experiment import Experiment, Result, median_and_worst
+from bench.framework.material import simulated_subjects
 from bench.subjects.simulated_wearer import bench_rig, phases
 from jointfit_daemon.calibration import CalibrationError, CalibrationTrial, SensorTrack
 from jointfit_daemon.calibration.phases import (
@@ -208,7 +208,7 @@ def _row(method: Method) -> Callable[[Path], list[Result]]:
             Result("knee, subject of the demo", errors[0].knee, goal),
         ]
         for name in ("knee", "thigh", "shank"):
-            figures += spread(name, [getattr(each, name) for each in errors])
+            figures += median_and_worst(name, [getattr(each, name) for each in errors])
         for name, ideal in (("within_1_sd", 0.68), ("within_2_sd", 0.95)):
             share = float(np.mean([getattr(each, name) for each in errors]))
             label = f"knee {name.replace('_', ' ')} (ideal {ideal})"
@@ -223,16 +223,8 @@ def centers(_: Path) -> list[Result]:
     errors = people()["anchored"]
     figures: list[Result] = []
     for joint in ("hip", "knee", "ankle"):
-        figures += spread(joint, [each.centers_mm[joint] for each in errors], "mm")
+        figures += median_and_worst(joint, [each.centers_mm[joint] for each in errors], "mm")
     return figures
-
-
-def spread(name: str, values: list[float], unit: str = "deg") -> list[Result]:
-    nothing = float("inf")
-    return [
-        Result(f"{name}, median", float(np.median(values)), nothing, unit=unit),
-        Result(f"{name}, worst", max(values), nothing, unit=unit),
-    ]
 
 
 IDS: dict[Method, str] = {
@@ -248,7 +240,7 @@ EXPERIMENTS = (
             f"Live errors of knee flexion and segments, {len(SEEDS)} simulated subjects, "
             f"method {method}",
             _row(method),
-            SIMULATED_SUBJECTS,
+            simulated_subjects(len(SEEDS)),
             long=True,
             headline=method == "anchored",
         )
@@ -258,7 +250,7 @@ EXPERIMENTS = (
         "simulated-leg-joint-centers",
         f"Joint centres of {len(SEEDS)} simulated subjects from the functional calibration",
         centers,
-        SIMULATED_SUBJECTS,
+        simulated_subjects(len(SEEDS)),
         long=True,
     ),
 )

@@ -18,7 +18,7 @@ from bench.baselines import fusion_methods
 from bench.experiments.fusion.recorded_movements import DEFAULT, NAMES, NOTHING, flexion_scores
 from bench.experiments.fusion.simulated_leg import take_pose, wear_live
 from bench.framework.experiment import Experiment, Result
-from bench.framework.material import SIMULATED_SUBJECTS
+from bench.framework.material import simulated_subjects
 from bench.subjects.recorded_knee import Judge, KneeTrial
 from bench.subjects.simulated_wearer import bench_rig, phases
 from jointfit_daemon.calibration.anatomy import track_clusters
@@ -144,7 +144,7 @@ EXPERIMENTS = (
         "all-methods-simulated-subjects",
         f"Errors of all methods, {len(SEEDS)} simulated subjects with soft-tissue artefact",
         simulated,
-        SIMULATED_SUBJECTS,
+        simulated_subjects(len(SEEDS)),
         long=True,
     ),
 )

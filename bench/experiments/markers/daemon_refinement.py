@@ -14,7 +14,7 @@ import numpy as np
 
 from bench.experiments.fusion.simulated_leg import SEEDS, SEGMENTS, errors_of, take_pose, wear_live
 from bench.framework.experiment import Experiment, Result
-from bench.framework.material import SIMULATED_SUBJECTS
+from bench.framework.material import simulated_subjects
 from bench.subjects.simulated_wearer import bench_rig, phases
 from jointfit_daemon.calibration.anatomy import track_cluster
 from jointfit_daemon.calibration.phases import fit_calibration, fit_plate_alignment
@@ -123,7 +123,7 @@ EXPERIMENTS = (
         f"Change of the errors by marker refinement during calibration, {len(SEEDS)} simulated "
         "subjects",
         refined,
-        SIMULATED_SUBJECTS,
+        simulated_subjects(len(SEEDS)),
         long=True,
     ),
 )

@@ -20,7 +20,7 @@ from bench.experiments.sensor_faults.loss_slip_drift import (
     fuser_of,
 )
 from bench.framework.experiment import Experiment, Result
-from bench.framework.material import SIMULATED_SUBJECTS
+from bench.framework.material import simulated_subjects
 from bench.subjects import faulty_wearer
 from bench.subjects.faulty_wearer import PULL_S, SEGMENTS, STAY_S
 from jointfit_daemon.kinematics import rotation
@@ -194,7 +194,7 @@ EXPERIMENTS = (
         "magnetic-disturbance-one-sensor",
         "The heading of one sensor is disturbed by 20 to 40° for half a minute",
         partial(magnet, groups=ALONE),
-        SIMULATED_SUBJECTS,
+        simulated_subjects(len(PEOPLE)),
         long=True,
         known_misses={"delay of the recovery report, worst": NOT_RECOVERED},
     ),
@@ -202,7 +202,7 @@ EXPERIMENTS = (
         "magnetic-disturbance-both-sensors",
         "The headings of both sensors of a segment are disturbed by 20 to 40° for half a minute",
         partial(magnet, groups=BOTH),
-        SIMULATED_SUBJECTS,
+        simulated_subjects(len(PEOPLE)),
         long=True,
     ),
 )

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.framework.experiment import Experiment, Result
-from bench.framework.material import SIMULATED_SUBJECTS
+from bench.framework.material import simulated_subjects
 from bench.subjects.simulated_wearer import bench_rig, phases
 from jointfit_daemon.calibration.phases import fit_plate_alignment
 from jointfit_daemon.units import NS_PER_MS
@@ -53,7 +53,7 @@ EXPERIMENTS = (
         "lag-plate",
         "Error of the lag from the align phase, eight simulated plates",
         on_the_plate,
-        SIMULATED_SUBJECTS,
+        simulated_subjects(len(SEEDS)),
         long=True,
     ),
 )
