@@ -1,8 +1,9 @@
 """Experiments and their results.
 
 A module of ``bench.experiments`` lists its experiments in a tuple ``EXPERIMENTS``. Experiments use
-seeded random generators and read recordings. The recordings are next to the checkout and never part
-of it. If recordings or packages of an experiment are missing, it is skipped with the reason.
+seeded random generators and read recordings. The recordings are in a folder next to the checkout,
+and never part of the checkout. If recordings or packages of an experiment are missing, the
+experiment is skipped with the reason.
 """
 
 from __future__ import annotations

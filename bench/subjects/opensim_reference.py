@@ -1,8 +1,8 @@
 """Inverse kinematics of OpenSim, the reference for refined marker sets.
 
 Invariant: joints, scaling and weights of the model are those of its file. Only the marker positions
-on their bodies are replaced. Forces are removed, because inverse kinematics does not use them and
-they need time.
+on their bodies are replaced. Forces are removed, because they need time and inverse kinematics does
+not use them.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 _ACCURACY = 1e-5
 """Default accuracy of InverseKinematicsTool."""
 CONVERGED = 1e-7
-"""Accuracy at which the errors have converged. They differ by less than 2 micrometres from the
-errors at 1e-9."""
+"""Accuracy at which the errors have converged. These errors differ by less than 2 micrometres from
+the errors at 1e-9."""
 
 
 @dataclass(frozen=True, slots=True)

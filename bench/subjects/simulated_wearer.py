@@ -38,7 +38,7 @@ MOVES = {
     "arm": ("functional",),
     "trunk": ("functional",),
 }
-"""Motions of the functional calibration, by limb. They have equal durations."""
+"""Motions of the functional calibration, by limb. All motions have the same duration."""
 PLATE_S, STAND_S, FUNCTIONAL_S = 24.0, 9.0, 60.0
 _CAN_BLOCKS = 7
 """Number of blocks of 256 identifiers in the range of 11-bit identifiers."""

@@ -56,7 +56,8 @@ SENSORS = {
 """Three markers for each sensor. The left shank has only three markers, so its two sensors share
 them."""
 MEDIAL = ("r_mknee", "r_mankle", "L_mknee", "L_mankle")
-"""Markers that only the static trial contains. With them, the bones would differ in other trials.
+"""Markers that only the static trial contains. With these markers, the bones would differ in other
+trials.
 """
 
 

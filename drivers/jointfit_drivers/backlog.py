@@ -1,9 +1,10 @@
 """Delay of the messages of one device, relative to its fastest messages.
 
-After a silence, buffered messages arrive together. All of them are late; the first has the largest
-delay and the last the smallest. Device time and arrival time then advance differently although the
-device continued. Between two messages, e is the elapsed arrival time and d is the advance of device
-time. The delay L' of the second message follows from the delay L of the first:
+After a silence, buffered messages arrive together. All these messages are late. The first message
+has the largest delay, and the last has the smallest. Device time and arrival time then advance
+differently although the device continued. Between two messages, e is the elapsed arrival time and d
+is the advance of device time. The delay L' of the second message follows from the delay L of the
+first:
 
     L' = max(0, L + (1 - m) e - d),   m = 0.1 %.
 

@@ -30,7 +30,7 @@ class CanDecoder(ABC):
     ids : collection of CanKey
         Identifiers of the device: number, and whether it has 29 bits. Other frames are ignored.
     samples : CheckedSamples
-        Checks for samples. `convert` adds its samples to them.
+        Checks for samples. `convert` adds its samples to these checks.
     """
 
     def __init__(self, ids: Collection[CanKey], samples: CheckedSamples) -> None:

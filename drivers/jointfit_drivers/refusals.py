@@ -24,5 +24,5 @@ class Refusals:
         return Corrupt(size, reason, rejected=1)
 
     def flush(self) -> list[Decoded]:
-        """Reject a sample that waits for confirmation; this class has none, but subclasses may."""
+        """Reject a sample that waits for confirmation; only subclasses have such samples."""
         return []

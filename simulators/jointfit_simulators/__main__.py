@@ -5,7 +5,8 @@ NAME``, ``unplug ID``, ``plug ID``, ``reboot ID``, ``stick ID``, ``free ID``, ``
 ``drift ID DEG``, ``occlude on|off``, ``hide MARKER``, ``show MARKER``, ``exchange MARKER MARKER``,
 ``mocap stop|start|restart``, ``pause on|off``, ``status``, ``quit``. ID is a sensor, or ``can0``
 for the bus adapter; ``reboot`` also accepts ``mocap``. The option ``--at SECONDS=COMMAND``
-schedules a command. The simulator continues after the end of stdin. SIGTERM and SIGINT stop it.
+schedules a command. The simulator continues after the end of stdin. SIGTERM and SIGINT stop the
+simulator.
 
 Invariant: stdout contains JSON lines only. One line reports that all devices are ready. Each
 command ``status`` yields a line, each invalid command yields ``{"error": …}``, and each motion

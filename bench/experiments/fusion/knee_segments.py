@@ -85,7 +85,7 @@ def _mean(trial: KneeTrial) -> tuple[Array, Array]:
 
 
 def baselines(data: Path) -> list[Result]:
-    """Single sensors, their mean, and the regressions of the patent."""
+    """Errors of single sensors, of their mean, and of the regressions of the patent."""
     squats = Squats(data)
     said = {
         "single sensor (S2, S4)": (_single(1), (9.04, 9.00, 6.15)),

@@ -2,8 +2,8 @@
 
 The subjects are simulated with the settings of the demo. The ground truth is their bones, which no
 fit receives. The calibration uses circles and walking. Squats and sit-to-stand are learned in three
-rounds. The evaluation uses later repetitions of both, and of walking to detect forgetting. Errors
-are RMS over all subjects. Segment errors include heading drift.
+rounds. The evaluation uses later repetitions of these two movements, and of walking to detect
+forgetting. Errors are RMS over all subjects. Segment errors include heading drift.
 """
 
 from __future__ import annotations

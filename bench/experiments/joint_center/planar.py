@@ -240,7 +240,7 @@ def ellipses(_: Path) -> list[Result]:
 
 def peers(_: Path) -> list[Result]:
     """Accuracy and time of the packages circle-fit and SciPy in the same run, at 45° and 5 mm."""
-    from circle_fit import hyperLSQ, hyperSVD, lm, taubinSVD  # noqa: PLC0415 - only this row's
+    from circle_fit import hyperLSQ, hyperSVD, lm, taubinSVD  # noqa: PLC0415 - only here
     from scipy.optimize import least_squares  # noqa: PLC0415 - slow to import
 
     rng = np.random.default_rng(9)

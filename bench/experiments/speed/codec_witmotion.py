@@ -72,7 +72,7 @@ def _peer() -> Callable[[], object]:
     imu = package.IMU.__new__(package.IMU)
     imu.should_exit = False
     received: list[object] = []
-    imu._handle_message = received.append  # noqa: SLF001 - its reader has no other exit
+    imu._handle_message = received.append  # noqa: SLF001 - no public output
     imu.ser = _Wire(imu)
 
     def read() -> None:

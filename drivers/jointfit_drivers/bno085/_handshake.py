@@ -1,9 +1,9 @@
-"""Start of a BNO085: makes it send the required reports, or raises an error with the cause.
+"""Start of a BNO085: the driver requests the required reports, or raises an error with the cause.
 
 In the mode UART-RVC, the device sends without a request and ignores the host. In the mode
 UART-SHTP, it is silent after a reset. The driver reads the settings of the reports, and changes
-only those that differ. The device loses these settings at the next reset, because the driver does
-not store them.
+only settings that differ. The device loses these settings at the next reset, because the driver
+does not store them.
 
 Source: BNO08X data sheet 1000-3927, section 1.3.1. Bytes to the device must be separated by 100 us.
 """
@@ -157,7 +157,7 @@ async def ensure_shtp(port: SerialPort, emit: Emit, settings: Bno085Settings) ->
 async def _interval(
     conversation: ShtpConversation, request: bytes, settings: Bno085Settings
 ) -> int:
-    """Send a request; return the interval of the report in the reply, us; 0 if it is off."""
+    """Send a request; return the report's interval, us, from the reply; 0 if the report is off."""
     reply = await conversation.control(request, tries=3)
     found = None if reply is None else decode_interval(reply)
     if found is None:

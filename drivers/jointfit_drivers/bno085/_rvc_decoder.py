@@ -4,8 +4,8 @@ The orientation of a sample is *canonical*: a Hamilton unit quaternion, scalar f
 sensor to a world with x east, y north and z up (`jointfit_protocols.orientation`).
 
 According to the data sheet, yaw, pitch and roll are successive rotations about z, y and x
-(``zyx``). The example message of the data sheet contradicts this. It contains pitch -1.10 and roll
-20.85 degrees with accelerations of -371, -20 and 977 mg. With pitch about x and roll about y
+(``zyx``). The example message of the data sheet contradicts this order. It contains pitch -1.10 and
+roll 20.85 degrees with accelerations of -371, -20 and 977 mg. With pitch about x and roll about y
 (``zxy``),
 
 .. math:: R = R_z(\text{yaw})\, R_x(\text{pitch})\, R_y(\text{roll}), \qquad
@@ -95,7 +95,8 @@ class RvcDecoder(SerialMessageDecoder[RvcFrame]):
         return out
 
     def _compare(self, frame: RvcFrame) -> list[Decoded]:
-        """Compare both orders of axes with an acceleration at rest; warn if only the other fits."""
+        """Compare both axis orders with an acceleration at rest; warn if only the unused order
+        fits."""
         x, y, z = frame.acceleration
         strength = sqrt(x * x + y * y + z * z) / _G_COUNTS
         if abs(strength - 1.0) > _REST:

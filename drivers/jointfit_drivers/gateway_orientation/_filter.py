@@ -72,7 +72,8 @@ SETTLED_SD = radians(5.0)
 CONVERGE_S = 60.0
 """Longest duration of the estimation at the start, s."""
 KNOWN_BIAS_SD = radians(0.1)
-"""Standard deviation of the bias, rad/s, that VQF reaches in motion (its ``biasSigmaMotion``)."""
+"""Standard deviation of the bias, rad/s, that VQF reaches in motion (``biasSigmaMotion`` of
+VQF)."""
 FASTEST = 200.0
 """Largest plausible angular rate, rad/s; equal to 11 000 degrees per second."""
 HARDEST = 5000.0
@@ -108,8 +109,8 @@ class FilterOutput(NamedTuple):
     """Output of the filter for one reading."""
 
     q_world_sensor: Quaternion
-    """Orientation in an ENU world. With a magnetometer, y is magnetic north, otherwise
-    arbitrary."""
+    """Orientation in an ENU world. With a magnetometer, y points to magnetic north. Otherwise the
+    heading is arbitrary."""
     rate: Vector
     """Angular rate without bias, sensor axes, rad/s."""
 
@@ -118,8 +119,8 @@ class FilterStep(NamedTuple):
     """Result of one reading."""
 
     oriented: tuple[FilterOutput, ...]
-    """Orientations. There is none while the filter settles, then one per reading. Without a
-    settling time, the second reading returns the orientations of the first and second reading."""
+    """Orientations: none while the filter settles, and later one per reading. Without a settling
+    time, the second reading returns the orientations of the first and second reading."""
     missing: int = 0
     """Number of readings missing before this reading."""
     restarted: bool = False
@@ -167,8 +168,8 @@ class GatewayOrientation:
     magnetometer : bool
         Whether the heading comes from the magnetometer (9D). Otherwise it drifts (6D).
     settle_s : float
-        Longest time without output after a start of the filter, s. Without magnetometer it is at
-        most `SETTLE_S`.
+        Longest time without output after a start of the filter, s. Without magnetometer this time
+        is at most `SETTLE_S`.
     """
 
     def __init__(

@@ -1,7 +1,8 @@
 """Samples of an IMU whose orientation the gateway computes from raw measurements.
 
-`RawSamples` contains the orientation filter, and reports its state, gaps and saturation as device
-events. Drivers convert the measurements of their devices to a `RawReading` with a `RawStamp`.
+`RawSamples` contains the orientation filter. It reports the state of the filter, gaps and
+saturation as device events. Drivers convert the measurements of their devices to a `RawReading`
+with a `RawStamp`.
 
 Invariant: the output depends only on the readings fed. The module reads no clock and no port.
 """
@@ -27,7 +28,8 @@ if TYPE_CHECKING:
     from jointfit_drivers.gateway_orientation._settings import GatewaySettings
 
 _REPORT_NS, _SOON_NS = 10_000_000_000, 1_000_000_000
-"""Intervals between state events of the filter, ns: in general, and after a change."""
+"""Interval between two events with the state of the filter, ns, and shortest interval after a
+change."""
 FAST = 5.0
 """Angular rate below which no gyroscope saturates, rad/s."""
 _NEW_HEADING = (
@@ -89,7 +91,7 @@ class RawSamples:
 
     @classmethod
     def of(cls, settings: GatewaySettings) -> Self:
-        """Return an object for a sensor with these settings."""
+        """Return a `RawSamples` for a sensor with these settings."""
         calibration = settings.sensor_calibration
         return cls(
             settings.rate_hz,
@@ -101,7 +103,7 @@ class RawSamples:
 
     @classmethod
     def maker(cls, settings: GatewaySettings) -> Callable[[], Self] | None:
-        """Return a function that creates an object; None if the device computes the orientation."""
+        """Return a function that creates a `RawSamples`; None if the device sends orientations."""
         return partial(cls.of, settings) if settings.orientation == "gateway" else None
 
     @property
@@ -179,7 +181,7 @@ class RawSamples:
         return out
 
     def _state_events(self) -> list[Decoded]:
-        """Return an event with the filter's state if it is due."""
+        """Return the event with the filter's state if it is due, and the first heading warning."""
         out: list[Decoded] = []
         if not self._started and not self.magnetometer:
             out.append(DeviceEvent("warning", _NEW_HEADING))
@@ -221,6 +223,6 @@ def _sample(
 ) -> ImuSample:
     q = oriented.q_world_sensor
     arrival_ns, ticks, counter, status = stamp
-    # The device sends the mean rate since the previous sample, not the current rate.
+    # The device sends the mean rate since the previous sample, so there is no current rate.
     rate, force, field = None, reading.force, reading.magnetic
     return ImuSample(arrival_ns, q, q, ticks, counter, status, rate, force, field)

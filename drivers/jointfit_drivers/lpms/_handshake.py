@@ -1,4 +1,4 @@
-"""Start of an LPMS sensor: makes it stream, or raises an error that explains the failure.
+"""Start of an LPMS sensor: the driver makes it stream, or raises an error with the cause.
 
 The driver reads the settings of the sensor and writes only settings that differ. It then reads them
 again, because old firmware acknowledges nothing. The sensor stores the settings in flash only with

@@ -1,4 +1,4 @@
-"""Start of a MIP device: makes it stream, or raises an error that explains the failure.
+"""Start of a MIP device: the driver makes it stream, or raises an error with the cause.
 
 The driver reads the settings of the device, and writes only settings that differ. Written settings
 are volatile: without ``persist``, the device returns to its stored settings at the next power-up. A

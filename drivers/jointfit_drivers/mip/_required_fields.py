@@ -41,7 +41,8 @@ class RequiredFields(NamedTuple):
 
     @property
     def packet_bytes(self) -> int:
-        """Size of the smallest sufficient packet of a legacy device, bytes; others send less."""
+        """Size of a legacy device's smallest sufficient packet, bytes; current devices send
+        less."""
         fields = self.with_time("legacy")
         return _FRAME_BYTES + sum(field_bytes(self.data_set, field) for field in fields)
 

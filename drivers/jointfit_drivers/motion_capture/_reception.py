@@ -44,7 +44,7 @@ async def run_until(
     limit_s : float
         Longest wait for the expected data, s.
     further_s : float
-        Duration of the connection after their arrival, s.
+        Duration of the connection after the arrival of the expected data, s.
     """
     running = asyncio.create_task(connection, name="connection")
     waiting = asyncio.create_task(arrived.wait(), name="expected data")

@@ -22,7 +22,7 @@ async def gather_servers(named: Sequence[Search], searched: Sequence[Search]) ->
     named : sequence of coroutines
         Searches at named hosts. Their answers also contain the names of markers and bodies.
     searched : sequence of coroutines
-        Searches in networks. A named host may answer them as well.
+        Searches in networks. A named host may also answer these searches.
     """
     async with asyncio.TaskGroup() as group:
         tasks = [group.create_task(search) for search in (*named, *searched)]

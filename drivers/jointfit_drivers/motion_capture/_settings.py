@@ -28,7 +28,7 @@ def _address(text: str) -> IPv4Address | None:
 class ServerSettings(MocapSettings):
     """A ``[mocap]`` table with the address of a server.
 
-    The tables of device families derive from it.
+    The tables of device families derive from this class.
     """
 
     server: str = Field(description="address or name of the PC that runs the camera software")

@@ -2,9 +2,10 @@
 
 A labeled marker has the id ``model << 16 | member``. The model is a rigid body, a skeleton or an
 asset. The name of a member is the marker name in the description (bitstream 4.0 and later). Without
-it, the name is that of the marker at the same position in the marker set with the model's name, or
-else ``Marker1``, ``Marker2`` and so on. Markers of a set without a model are identified by set and
-position. The set ``all`` is ignored, because it repeats the other sets.
+such a name, the member has the name of the marker at the same position in the marker set with the
+model's name. If there is no such set, the names are ``Marker1``, ``Marker2`` and so on. Markers of
+a set without a model are identified by set and position. The set ``all`` is ignored, because it
+repeats the other sets.
 
 `jointfit_drivers.motion_capture.bind_columns` defines the names of the columns.
 

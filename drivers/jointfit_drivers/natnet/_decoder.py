@@ -1,9 +1,9 @@
 """Decoder of NatNet servers: converts datagrams to optical frames and clock echoes.
 
-A capture contains datagrams in both directions. Datagrams from a client have no effect, except that
-the arrival of an echo request is the sending time for its answer. A frame that arrives before the
-model is dropped and counted in `unpublished`. Every number is checked against its range before it
-is used.
+A capture contains datagrams in both directions. Datagrams from a client have one effect: the
+arrival of an echo request is used as the sending time of the request. A frame that arrives before
+the model is dropped and counted in `unpublished`. Every number is checked against its range before
+it is used.
 
 Invariant: the output depends only on the chunks fed. The decoder reads no clock and no socket.
 """
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from jointfit_drivers.natnet._settings import NatNetSettings
 
 _ECHO_LIMIT_NS = 10**9
-"""Largest age of an echo answer for which it is used for the clock, ns."""
+"""Largest round-trip time of an echo that is used for the clock, ns."""
 _PENDING_ECHOES = 8
 _NEWEST = NewestKnown((4, 2), "Motive", "NatNet")
 """Newest bitstream version with a published description. Sections of later versions are skipped by
@@ -184,7 +184,7 @@ class NatNetDecoder:
             out.append(DeviceEvent("error", text, {"bitstream": name}))
 
     def _model(self, model: natnet.ModelDefinition, out: list[Decoded]) -> None:
-        """Assign the columns to a model; append its changes and warnings."""
+        """Assign the columns to a model; append changes of the columns and warnings."""
         binding = bind_model(model, self._wanted_markers, self._wanted_bodies)
         before = None if self._binding is None else self._binding.columns
         columns, events = renew_columns(before, binding.columns, self.unpublished)

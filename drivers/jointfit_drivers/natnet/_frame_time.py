@@ -60,7 +60,7 @@ class FrameTime:
         return None if found is None else found - self._ahead_ns
 
     def report_timecode(self, frame: FrameOfData, out: list[Decoded]) -> None:
-        """Report the timecode of the first frame that has one, and report if it is lost."""
+        """Report the first timecode, and each change between frames with and without timecode."""
         code = timecode_of(frame)
         if (code is not None) == self._coded:
             return

@@ -35,7 +35,7 @@ _QUALITY_BITS = MARKER_OCCLUDED | MARKER_POINT_CLOUD_SOLVED
 
 
 class FrameColumns(NamedTuple):
-    """Arrays of one `MocapFrame`, and the data that they do not contain."""
+    """Arrays of one `MocapFrame`, and findings about the frame."""
 
     markers: NDArray[np.float64]
     body_positions: NDArray[np.float64]

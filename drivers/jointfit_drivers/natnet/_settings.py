@@ -53,6 +53,6 @@ class NatNetSettings(ServerSettings):
         """Mean and standard deviation of the delay from exposure to arrival, ms.
 
         The value applies to frames that PTP-synchronized cameras stamp. For frames that the server
-        stamps it is None, because echoes measure the server's clock.
+        stamps, the value is None, because echoes measure the server's clock.
         """
         return None if self.time == "server" else (self.latency_ms, self.latency_ms / 2)

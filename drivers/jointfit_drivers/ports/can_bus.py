@@ -162,9 +162,9 @@ class SharedBus:
     ) -> None:
         """Emit every frame that has one of `ids`, in chunks of packed frames, until cancelled.
 
-        Error frames are emitted as well. So are the records with which this host counts dropped
-        frames (`host_dropped`) and corrupt bytes (`host_corrupt`). A record of corrupt bytes is
-        emitted for one device only, so that the bytes are counted once.
+        Error frames are emitted as well, and the records with which this host counts dropped frames
+        (`host_dropped`) and corrupt bytes (`host_corrupt`). A record of corrupt bytes is emitted
+        for one device only, so that the bytes are counted once.
 
         Parameters
         ----------
@@ -174,7 +174,7 @@ class SharedBus:
             Identifiers of the device, each with the name of its quantity for error messages.
         emit : callable
             Function that receives the chunks. If it raises an exception, the pump ends and raises
-            it.
+            this exception.
         silence_s : float
             Time without a frame with the identifier `needed` after which the device counts as lost,
             s.

@@ -79,8 +79,8 @@ class SerialPort:
     Raises
     ------
     DeviceLostError
-        On entry: the port is absent, in use, or not (yet) permitted. Later: it is unplugged or
-        silent.
+        On entry: the port is absent, in use, or not (yet) permitted. Later: the port is unplugged
+        or silent.
     DeviceMisconfiguredError
         On entry: the file is not a serial port, or the port does not support the speed.
     """
@@ -152,7 +152,7 @@ class SerialPort:
         ----------
         emit : callable
             Function that is called in the event loop with each chunk. If it raises an exception,
-            the pump ends and raises it.
+            the pump ends and raises this exception.
         silence_s : float, optional
             Time without a byte after which the device counts as lost, s; None waits without limit.
 

@@ -100,8 +100,8 @@ class TcpConnection:
             The connection is lost, or the server does not read.
         """
         sent = self._socket.send(data)
-        # Requests are short, so one that does not fit into the send buffer of the kernel means that
-        # the server has not read the requests before it.
+        # Requests are short. If a request does not fit into the send buffer of the kernel, the
+        # server has not read the requests before it.
         if sent != len(data):
             raise OSError(errno.ENOBUFS, "the server does not read its requests")
 

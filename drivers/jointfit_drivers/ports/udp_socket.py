@@ -20,8 +20,8 @@ from jointfit_drivers.ports._socket_stamps import ANCILLARY_BYTES, SocketStamps
 MAX_DATAGRAM = 65_507
 """Largest payload of a UDP datagram over IPv4, bytes."""
 DRAIN = 64
-"""Largest number of datagrams read per wake-up. Others stay in the queue, so that other sockets are
-read as well."""
+"""Largest number of datagrams read per wake-up. Further datagrams stay in the queue, so that other
+sockets are read as well."""
 RECEIVE_BUFFER = 1 << 20
 """Requested size of the receive buffer, bytes. It holds half a second of large frames while the
 host is busy."""

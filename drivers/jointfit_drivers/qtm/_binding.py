@@ -106,6 +106,6 @@ def bind_settings(
 def segment_key(skeleton: int, segment: int) -> int:
     """Return the key of a skeleton segment.
 
-    It is negative, so that it differs from body indices.
+    The key is negative, so that it differs from body indices.
     """
     return -1 - (skeleton << _MEMBER_BITS | segment)

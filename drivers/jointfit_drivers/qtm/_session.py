@@ -222,7 +222,7 @@ class QtmSession:
         )
 
     async def _ask(self, command: str, *kinds: type) -> qtm.Message:
-        """Send a command; return its answer, the first message of one of these types."""
+        """Send a command; return its answer: the first message whose type is in `kinds`."""
         self._answers.clear()
         self._link.send(qtm.encode(qtm.Command(command)))
         return await self._answer(kinds, command)

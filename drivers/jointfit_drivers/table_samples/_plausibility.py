@@ -23,7 +23,7 @@ _CHECKED = 100
 _ROUND = 0.05
 """Largest deviation of the median norm of quaternions from 1."""
 _LIGHT, _HEAVY = 6.0, 14.0
-"""Plausible range of the median specific force, m/s^2. Outside of it, the scale is wrong."""
+"""Plausible range of the median specific force, m/s^2. Outside this range, the scale is wrong."""
 _GOOD, _CALM = 0.75, 0.5
 """Smallest shares, for a correct table, of quaternions and of specific forces whose norm is in
 range."""

@@ -1,4 +1,4 @@
-"""Start of a VectorNav device: makes it stream, or raises an error that explains the failure.
+"""Start of a VectorNav device: the driver makes it stream, or raises an error with the cause.
 
 The driver reads registers, and writes only registers that differ. Written values are volatile:
 without ``persist``, the device returns to its stored values at the next power-up. A fault that may

@@ -39,7 +39,7 @@ _DEEPEST = 200
 
 
 class ViconColumns(NamedTuple):
-    """Arrays of one `MocapFrame`, and the data that they do not contain."""
+    """Arrays of one `MocapFrame`, and findings about the frame."""
 
     markers: Array
     body_positions: Array

@@ -1,8 +1,8 @@
 """Decoder of VRPN servers: converts messages to optical frames.
 
 The poses of one instant form a frame (`FrameAssembler`). The name of a body is the name of its
-tracker. It is known when the server has described the tracker or sent its first report. Names in
-rig.toml that are still unknown after half a second are reported.
+tracker. The name is known when the server has described the tracker, or has sent its first report.
+Names in rig.toml that are still unknown after half a second are reported.
 
 Invariant: the output depends only on the chunks fed. The decoder reads no clock and no socket.
 """

@@ -3,8 +3,8 @@
 VRPN has no frames: every body has its own messages, and a body that is not visible has none. The
 reports of one frame have nearly equal times. A frame ends in three cases: every expected body has
 reported, a body reports again, or a report is half a period later. A body is expected until it has
-not reported for three periods, but for at least 100 ms. It is missing in every frame without its
-report.
+not reported for three periods, but for at least 100 ms. The body is missing in every frame without
+its report.
 
 Invariant: the module is pure. The result depends only on the reports, not on their arrival. A frame
 contains each body at most once.

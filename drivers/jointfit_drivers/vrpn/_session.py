@@ -5,7 +5,7 @@
 2. Both sides send a cookie that contains their version. Other major versions are refused.
 3. With ``transport = "udp"``, the session sends the UDP port for poses.
 4. Poses follow. Before the server counts as silent, the session requests an answer once per second.
-   The report can then name the cause: no server, or no visible body.
+   The error message can then name the cause: no server, or no visible body.
 
 Invariant: every chunk is emitted in the order of arrival, so that a replay has the same input.
 """

@@ -1,4 +1,4 @@
-"""Start of a WitMotion device: makes it send the required frames, or raises an error.
+"""Start of a WitMotion device: the driver requests the required frames, or raises an error.
 
 The device does not acknowledge writes. The driver first listens, and reads the settings if the
 firmware answers. It writes only settings that differ, and listens again. The written registers are

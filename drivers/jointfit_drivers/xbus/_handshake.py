@@ -1,4 +1,4 @@
-"""Start of an Xbus device: makes it measure, or raises an error that explains the failure.
+"""Start of an Xbus device: the driver makes it measure, or raises an error with the cause.
 
 The driver reads the stored configuration of the device. It changes a setting only if the difference
 matters and ``persist`` permits the change, because an Xbus device stores every setting in flash at

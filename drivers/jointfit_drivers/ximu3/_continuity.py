@@ -6,7 +6,8 @@ t0, t1 and t2. Their deviation from a uniform motion, as an angle in rad, is
 
     E = 2 |q2 - q1 - (q1 - q0) (t2 - t1) / (t1 - t0)|.
 
-The limit for E is twice the largest E of the last seconds, so a sensor that accelerates raises it.
+The limit for E is twice the largest E of the last seconds, so an acceleration of the sensor raises
+the limit.
 
 | message                                       | outcome                                          |
 |-----------------------------------------------|--------------------------------------------------|
@@ -47,8 +48,8 @@ _FASTEST = 60.0
 _JOLT = 0.05
 """Additional rotation that is always permitted, rad."""
 _LEARNED = 10
-"""Number of intervals from which the period is their mean. With fewer intervals, the period is the
-shortest of them."""
+"""Smallest number of intervals whose mean is used as the period. With fewer intervals, the period
+is the shortest interval."""
 _LONGER = 20
 """Number of consecutive intervals with the same number of periods that prove a changed rate."""
 _MOST_COUNTED = 50

@@ -1,4 +1,4 @@
-"""Start of an x-IMU3: checks the required settings, or raises an error that explains the failure.
+"""Start of an x-IMU3: the driver checks the required settings, or raises an error with the cause.
 
 The driver reads the settings of the device. It changes a setting only if the setting differs and
 ``persist`` permits the change, because the device also saves its settings when it is switched off.

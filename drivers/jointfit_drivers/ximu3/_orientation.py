@@ -2,7 +2,7 @@ r"""Orientation in data messages of an x-IMU3: quaternion, rotation matrix or Eu
 
 .. math:: R = R_z(\psi) R_y(\theta) R_x(\varphi), \qquad v_\mathrm{world} = R\, v_\mathrm{sensor}
 
-with yaw ψ, pitch θ and roll φ. A message contains them in the order roll, pitch, yaw.
+with yaw ψ, pitch θ and roll φ. A message contains the angles in the order roll, pitch, yaw.
 """
 
 from __future__ import annotations

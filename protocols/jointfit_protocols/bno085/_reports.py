@@ -112,7 +112,7 @@ class HubReport(NamedTuple):
 
 
 def split_reports(payload: bytes) -> list[bytes] | None:
-    """Return the reports of a packet; None if they do not fill it or if one is unknown."""
+    """Return the reports of a packet; None if they do not fill the packet, or if one is unknown."""
     reports, at, end = [], 0, len(payload)
     while at < end:
         size = _LENGTHS.get(payload[at])

@@ -77,7 +77,7 @@ def _read_frame(buffer: bytes, at: int, base: int) -> RvcFrame | CorruptBytes | 
 
 
 class RvcCodec(ResynchronizingCodec[RvcFrame]):
-    """Codec that converts byte strings of any size to frames; their boundaries do not matter.
+    """Codec that converts a byte stream to frames; the stream may be split at any position.
 
     Runs of corrupt bytes are reported after at most 1024 bytes.
     """

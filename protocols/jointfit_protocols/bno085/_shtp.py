@@ -5,9 +5,9 @@
     7E | 00 | 7E                                                          query of the status
 
 Inside a frame, 7E and 7D are sent as 7D followed by the byte with bit 5 inverted. The length
-includes its own four bytes of header, and its bit 15 marks a continuation. There is no checksum. A
-packet is valid if its length field agrees with the length of the frame. Adjacent frames may share a
-flag (7E). Numbers are little-endian.
+includes the four bytes of the header. Bit 15 of the length field marks a continuation. There is no
+checksum. A packet is valid if its length field agrees with the length of the frame. Adjacent frames
+may share a flag (7E). Numbers are little-endian.
 
 Sources: BNO08X data sheet 1000-3927, section 1.3.1; SH-2 SHTP reference manual 1000-3600; for the
 control protocol, the vendor's host library (sh2, Apache-2.0).
@@ -92,7 +92,7 @@ def encode_shtp(channel: int, sequence: int, payload: bytes) -> bytes:
 
 
 def encode_status(available: int | None) -> bytes:
-    """Return a buffer status on the wire; if `available` is None, return the query for it."""
+    """Return a buffer status on the wire, or, if `available` is None, the query for the status."""
     return _encode_frame(_CONTROL, b"" if available is None else available.to_bytes(2, "little"))
 
 
@@ -103,7 +103,7 @@ def _encode_frame(protocol: int, data: bytes) -> bytes:
 
 
 class ShtpCodec:
-    """Codec that converts byte strings of any size to packets; their boundaries do not matter.
+    """Codec that converts a byte stream to packets; the stream may be split at any position.
 
     If the bytes between two flags form no packet, they become one `CorruptBytes`. Flags are counted
     separately.

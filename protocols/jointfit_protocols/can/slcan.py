@@ -141,12 +141,12 @@ class SlcanCodec:
         The ``t_ns`` of a frame is the start of its line. It is the arrival `t_ns` minus the
         duration of all characters from the start of the line on. On USB, the durations on the bus
         of this frame and of all later frames in `data` are subtracted instead. The stamp of a line
-        that lies completely in `data` is never earlier than the previous call.
+        that lies completely in `data` is never earlier than the `t_ns` of the previous call.
         """
         found: list[CanFrame | SlcanLine | CorruptBytes] = []
         *lines, rest = (self._pending + data).replace(b"\n", b"").split(b"\r")
         before = len(self._pending)  # bytes of earlier calls
-        # from a line's start to the end of `data`
+        # duration from a line's start to the end of `data`
         after_ns = (before + len(data)) * self._character_ns or sum(map(self._on_bus_ns, lines))
 
         for line in lines:
@@ -216,7 +216,7 @@ class SlcanCodec:
     ) -> None:
         """Append the frame at the end of a corrupt `line`, if there is one.
 
-        Noise may precede it.
+        Noise may precede the frame.
         """
         for at in range(max(0, len(line) - _WINDOW), len(line)):
             if line[at] in b"tTrR":

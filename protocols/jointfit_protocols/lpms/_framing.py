@@ -5,8 +5,8 @@
 
 Numbers are little-endian. LRC is the 16-bit sum of identifier, command, n and data. The vendor's
 documents permit two interpretations: the sum of the bytes, or the sum of 16-bit words in the head.
-Both are equal while identifier, command and n are below 256. The codec accepts both, and sends the
-sum of the bytes.
+Both sums are equal while identifier, command and n are below 256. The codec accepts both, and sends
+the sum of the bytes.
 
 Source: protocol pages of the vendor's knowledge base; OpenZen (MIT) for the two sums.
 
@@ -110,7 +110,7 @@ def _read_message(buffer: bytes, at: int, base: int) -> LpBusMessage | CorruptBy
 
 
 class LpBusCodec(ResynchronizingCodec[LpBusMessage]):
-    """Codec that converts byte strings of any size to messages; their boundaries do not matter.
+    """Codec that converts a byte stream to messages; the stream may be split at any position.
 
     Runs of corrupt bytes are reported after at most 1035 bytes.
     """

@@ -106,7 +106,7 @@ def _read_packet(buffer: bytes, at: int, base: int) -> MipPacket | CorruptBytes 
 
 
 class MipCodec(ResynchronizingCodec[MipPacket]):
-    """Codec that converts byte strings of any size to packets; their boundaries do not matter.
+    """Codec that converts a byte stream to packets; the stream may be split at any position.
 
     Runs of corrupt bytes are reported after at most 261 bytes.
     """

@@ -62,7 +62,7 @@ class PrecisionTime:
         return self._binary is not None
 
     def ns(self, precision: tuple[int, int] | None) -> int | None:
-        """Return the time in ns of its clock; None if it is missing or its unit is unknown."""
+        """Return the time of the PTP clock, ns; None if it is missing or the unit is unknown."""
         if precision is None or precision == (0, 0):
             self.absent += 1
             return None

@@ -60,7 +60,8 @@ class BodyDescription(NamedTuple):
     """Streaming id. The operator can edit it, so two bodies may have the same id."""
     parent: int = -1
     offset: Position = (0.0, 0.0, 0.0)
-    """Offset that the server has already applied to the pose. It must not be added."""
+    """Offset that the server has already applied to the pose. The offset must not be added
+    again."""
     positions: tuple[Position, ...] = ()
     """Positions of the markers in the body, m."""
     labels: tuple[int, ...] = ()

@@ -119,7 +119,7 @@ def _text(buffer: bytes, at: int, base: int) -> TextMessage | CorruptBytes | Non
 
 
 class VectorNavCodec(ResynchronizingCodec[VectorNavMessage]):
-    """Codec that converts byte strings of any size to messages; their boundaries do not matter.
+    """Codec that converts a byte stream to messages; the stream may be split at any position.
 
     Runs of corrupt bytes are reported after at most `MAX_MESSAGE` bytes.
     """

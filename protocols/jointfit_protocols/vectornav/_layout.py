@@ -4,10 +4,10 @@
 
 Bit k of ``groups`` announces the group k + 1. Bit k in the fields of a group announces the field k
 of this group. The payload contains the announced fields in ascending order, little-endian and
-without padding. Firmware since 2023 extends both. If bit 7 of the byte of groups is set, a second
-byte announces the groups from 9 on. If bit 15 of a word of fields is set, a second word announces
-the fields from 16 on. This module has no layout for a header with a field of unknown or variable
-size.
+without padding. Firmware since 2023 extends groups and fields. If bit 7 of the byte of groups is
+set, a second byte announces the groups from 9 on. If bit 15 of a word of fields is set, a second
+word announces the fields from 16 on. This module has no layout for a header with a field of unknown
+or variable size.
 
 Sources: VN-100 user manual (UM001), section 5, "binary output messages". The sizes of fields and
 the extensions are from the vendor's programming libraries (MIT; SDK 0.99).

@@ -79,7 +79,7 @@ def encode(kind: int, data: bytes) -> bytes:
 
 
 class WitMotionCodec(ResynchronizingCodec[WitMotionFrame]):
-    """Codec that converts byte strings of any size to frames; their boundaries do not matter.
+    """Codec that converts a byte stream to frames; the stream may be split at any position.
 
     Runs of corrupt bytes are reported after at most 1024 bytes.
     """

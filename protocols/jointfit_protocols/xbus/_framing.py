@@ -149,7 +149,7 @@ def _read_message(buffer: bytes, at: int, base: int) -> XbusMessage | CorruptByt
 
 
 class XbusCodec(ResynchronizingCodec[XbusMessage]):
-    """Codec that converts byte strings of any size to messages; their boundaries do not matter.
+    """Codec that converts a byte stream to messages; the stream may be split at any position.
 
     Runs of corrupt bytes are reported after at most 2055 bytes.
     """

@@ -197,7 +197,7 @@ def decode_output_settings(data: bytes) -> int | None:
 
 
 def decode_device_configuration(data: bytes) -> tuple[int, int] | None:
-    """Return output mode and settings in a Configuration; None unless it is of one device."""
+    """Return output mode and settings in a Configuration; None unless it describes one device."""
     if len(data) != _CONFIGURATION.size:
         return None
     devices, mode, settings = _CONFIGURATION.unpack(data)

@@ -6,7 +6,7 @@ message. The output configuration must contain the item TriggerIn1 or TriggerIn2
 
     | line U1 | polarity U1 | time U4, ticks of SampleTimeFine | frame U2 |
 
-The number of the output line depends on the series. It is 4, and 7 from the MTi-600 on.
+The number of the output line depends on the series. The number is 4; from the MTi-600 on, it is 7.
 
 Source: MT0101P rev. 2020.A. The layout of the item is from the vendor's public headers. These
 sources do not document the unit of the item's time.

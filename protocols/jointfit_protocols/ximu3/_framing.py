@@ -38,8 +38,8 @@ _QUATERNION = (0xD1, 26)
 _SHORTEST_RUN = 4
 """Number of consecutive messages of one kind from which they are decoded together."""
 _LONGEST_RUN = 64
-"""Largest number of messages decoded together. It limits the bytes that a failed attempt has
-read."""
+"""Largest number of messages decoded together. It limits the number of bytes that a failed attempt
+reads."""
 _TERMINATORS = bytes((TERMINATOR,)) * _LONGEST_RUN
 _new_data = tuple.__new__
 """Constructor of a message from all of its fields. It takes half of the time of the usual

@@ -29,7 +29,7 @@ Vector = tuple[float, float, float]
 
 
 class Part(NamedTuple):
-    """One segment, with the joint to its parent."""
+    """One segment, with the joint that connects it to its parent."""
 
     name: str
     parent: str | None

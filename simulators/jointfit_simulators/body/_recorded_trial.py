@@ -1,9 +1,9 @@
 """Recorded trials with sensors, bones and markers, interpolated between samples.
 
 The recording already contains soft-tissue artefacts and sensor alignment. The motion ``trial``
-plays it once and then keeps the last posture. The motion ``stand`` is the static pose. This pose
-follows from the sensor biases if they are known, with every segment upright by definition.
-Otherwise, it is the first recorded frame.
+plays the recording once, and then keeps the last posture. The motion ``stand`` is the static pose.
+This pose follows from the sensor biases if they are known, with every segment upright by
+definition. Otherwise, it is the first recorded frame.
 
 The file type follows from the suffix: ``.npz`` or ``.sto`` (quaternions) for sensors, ``.trc`` for
 markers, ``.json`` for biases (``{"q_bias": {"S1": [w, x, y, z]}}``). Files are y up, as OpenSim

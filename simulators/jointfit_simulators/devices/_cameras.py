@@ -141,8 +141,8 @@ class Cameras:
 def _fit(template: Array, markers: Array) -> tuple[Array, Array]:
     """Return position (n, 3) and orientation (n, 4) of a body from its markers (n, k, 3).
 
-    The rotation is fitted to the visible markers (Kabsch). With fewer than three markers, it is
-    NaN.
+    The rotation is fitted to the visible markers (Kabsch). With fewer than three markers, position
+    and orientation are NaN.
     """
     visible = np.isfinite(markers[:, :, 0])
     weight = (visible / np.maximum(visible.sum(axis=1, keepdims=True), 1))[:, :, None]

@@ -191,7 +191,7 @@ class XImu3Device(SerialDevice):
 
     @override
     def edge(self, device_ns: int, *, rising: bool = True) -> None:
-        """Send the message about an edge at the sync input of the accessory, if it is active."""
+        """Send the message about an edge at the sync input, if the accessory is active."""
         if self.streaming and self.settings["serial_mode"] == _ACCESSORY:
             self._write(self._data(DataKind.SYNC, self._ticks(device_ns), (float(rising),)))
 

@@ -88,7 +88,7 @@ class SensorPlace:
     sensors: int
     """Number of sensors in the scene."""
     sync_line: bool
-    """Whether a sync line is connected. The device reports its edges if it can."""
+    """Whether a sync line is connected. The device reports the edges of the line if it can."""
 
     @property
     def first_can_id(self) -> int:

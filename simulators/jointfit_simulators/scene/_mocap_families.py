@@ -103,7 +103,8 @@ class MocapFamily:
     """Function that returns a server, and the lines that follow the driver in the ``[mocap]``
     table."""
     sync_line: bool = False
-    """Whether ``sync_line`` is supported. A frame then states whether its exposure causes an edge.
+    """Whether ``sync_line`` is supported. If so, a frame states whether its exposure causes an
+    edge.
     """
 
 

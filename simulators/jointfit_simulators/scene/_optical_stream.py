@@ -1,6 +1,6 @@
 """Stream of camera frames, which are planned in blocks (computed in advance) and sent one by one.
 
-The optical world has z up in this module. The server converts to its own axes.
+The optical world has z up in this module. The server converts the frames to its own axes.
 
 Invariant: a frame contains its exposure time, even if it is sent late.
 """

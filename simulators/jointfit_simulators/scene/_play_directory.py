@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 STATE_FILE = ".jointfit-sim.json"
 """Name of the lock file. It contains ``{"pid": …, "command_port": …}`` for the next run."""
 _LARGEST = 1000
-"""Maximum number of bytes that are read from the lock file, more than this module writes."""
+"""Maximum number of bytes that are read from the lock file. This module writes fewer bytes."""
 _PORTS = range(1, 65536)
 
 
