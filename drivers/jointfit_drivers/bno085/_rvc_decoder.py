@@ -95,7 +95,7 @@ class RvcDecoder(SerialMessageDecoder[RvcFrame]):
         return out
 
     def _compare(self, frame: RvcFrame) -> list[Decoded]:
-        """Compare both axis orders with an acceleration at rest; warn if only the unused order
+        """Compare both axis orders with an acceleration at rest; warn if only the unused one
         fits."""
         x, y, z = frame.acceleration
         strength = sqrt(x * x + y * y + z * z) / _G_COUNTS

@@ -191,8 +191,7 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
         return [DeviceEvent("warning", text)]
 
     def _note_other_set(self, packet: MipPacket) -> list[Decoded]:
-        """Return a warning if a packet has an unknown data set, or the one that is not
-        configured."""
+        """Return a warning if a packet has an unknown data set, or one that is not configured."""
         if known_fields(packet.descriptor_set) is None:
             return self._take_unknown("packets", packet)
         field = self._other.get(packet.descriptor_set)

@@ -41,8 +41,7 @@ class RequiredFields(NamedTuple):
 
     @property
     def packet_bytes(self) -> int:
-        """Size of a legacy device's smallest sufficient packet, bytes; current devices send
-        less."""
+        """Size of the smallest sufficient packet, bytes, of legacy devices; others send less."""
         fields = self.with_time("legacy")
         return _FRAME_BYTES + sum(field_bytes(self.data_set, field) for field in fields)
 
