@@ -95,8 +95,7 @@ class RvcDecoder(SerialMessageDecoder[RvcFrame]):
         return out
 
     def _compare(self, frame: RvcFrame) -> list[Decoded]:
-        """Compare both axis orders with an acceleration at rest; warn if only the unused one
-        fits."""
+        """Compare both axis orders with gravity at rest; warn if only the unused order fits."""
         x, y, z = frame.acceleration
         strength = sqrt(x * x + y * y + z * z) / _G_COUNTS
         if abs(strength - 1.0) > _REST:
