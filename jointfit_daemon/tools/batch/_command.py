@@ -54,17 +54,13 @@ def batch(
     steps = _words("--do", do, STEPS)
     formats = _words("--to", to, [*SESSION_FORMATS]) if "export" in steps else ()
     if scheduler is not None and jobs is not None:
-        raise ValueError(
-            "--jobs: the cluster of --scheduler has its own workers: omit one of the options"
-        )
+        raise ValueError("--jobs: the cluster of --scheduler has its own workers: omit one option")
     if not folder.is_dir():
         raise ValueError(f"{folder}: expected a folder with recordings")
     output = (folder / "batch" if out is None else out).resolve()
     tasks = find_recordings(folder.resolve(), output, steps, formats)
     if not tasks:
-        raise ValueError(
-            f"{folder}: found no recording (.mcap): name the folder that contains them"
-        )
+        raise ValueError(f"{folder}: found no recording (.mcap): name a folder with recordings")
     output.mkdir(parents=True, exist_ok=True)
 
     if scheduler is not None:
