@@ -8,11 +8,12 @@ Invariant: this module names no device.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping  # noqa: TC003 - type of an attribute of a dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Sequence
 
 Level = Literal["ok", "note", "warning", "error", "unknown"]
 """Level of a finding. ``unknown`` means that the check could not be made."""
@@ -56,6 +57,8 @@ class FoundServer:
     """Names of the server's rigid bodies; empty if they were not requested."""
     markers: tuple[str, ...] = ()
     """Names of the server's labeled markers; empty if they were not requested."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Further keys of ``[mocap]`` that select this server among others at the same address."""
 
 
 class StreamSearch(Protocol):

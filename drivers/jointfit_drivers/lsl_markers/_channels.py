@@ -1,9 +1,12 @@
 """Assignment of the channels of an LSL stream to marker coordinates and body poses.
 
 The convention is the MoCap meta-data of XDF, the file format of LSL. Each channel has a label, a
-marker or an object, a type (PositionX to Z, OrientationA to D with scalar A, or Confidence) and a
-unit. If the type is missing, the end of the label (``T1_X``, ``Thigh.qw``) replaces it. If the
-channels have no labels, rig.toml defines the names, with x, y and z for each name.
+marker or an object, a type (PositionX to Z, OrientationA to D, or Confidence) and a unit. If the
+type is missing, the end of the label (``T1_X``, ``Thigh.qw``, ``Thigh_quat_w``) replaces it. If the
+channels have no labels, rig.toml defines the labels, or the names of markers with x, y and z each.
+
+The convention does not define which of OrientationA to D is the scalar. PhaseSpace sends it first,
+the OptiTrack program of LSL last.
 
 Invariant: the functions are pure. An unknown channel is reported and never guessed.
 """
@@ -15,22 +18,32 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.name_lists import list_names
 from jointfit_drivers.motion_capture import ModelEntry
+from jointfit_protocols.lsl import Channel
 
 if TYPE_CHECKING:
     from jointfit_drivers.lsl_markers._settings import LslMarkersSettings
     from jointfit_drivers.motion_capture import ColumnKey
-    from jointfit_protocols.lsl import Channel, StreamDescription
+    from jointfit_protocols.lsl import StreamDescription
 
 _POSITION = {"positionx": "x", "positiony": "y", "positionz": "z"}
 _ORIENTATION = {
-    "orientationa": "qw", "orientationb": "qx", "orientationc": "qy", "orientationd": "qz",
-    "orientationw": "qw", "orientationx": "qx", "orientationy": "qy", "orientationz": "qz",
-}  # fmt: skip
+    f"{word}{letter}": f"q{letter}"
+    for word, letters in (("orientation", "abcdwxyz"), ("quaternion", "wxyz"), ("rotation", "wxyz"))
+    for letter in letters
+}
 _EULER = {"orientationp": "euler", "orientationh": "euler", "orientationr": "euler"}
 _TYPES = _POSITION | _ORIENTATION | _EULER | {"confidence": "confidence"}
+_OTHER_TYPES = ("orient", "quat", "rot", "euler", "vel", "acc", "ang")
+"""First letters of the types of channels that contain no position, whatever their label."""
 _LABEL = re.compile(
-    r"(?P<name>.+?)[\s_.:/-]+(?:pos(?:ition)?[\s_.:/-]*)?(?P<part>q[wxyz]|[xyz])", re.IGNORECASE
+    r"(?P<name>.+?)[\s_.:/-]+"
+    r"(?:(?:pos(?:ition)?|(?P<turn>q(?:uat(?:ernion)?)?|rot(?:ation)?|orient(?:ation)?|ornt)"
+    r"|(?P<other>euler|vel(?:ocity)?))[\s_.:/-]*)?(?P<part>[wxyz])",
+    re.IGNORECASE,
 )
+_LAST_SCALAR = "naturalpoint"
+"""Manufacturer in the streams of the OptiTrack program of LSL, which sends the quaternion of a body
+as x, y, z, w in the channels OrientationA to D."""
 _UNITS_M = {
     "m": 1.0, "meter": 1.0, "meters": 1.0, "metre": 1.0, "metres": 1.0,
     "cm": 0.01, "centimeter": 0.01, "centimeters": 0.01, "centimetre": 0.01, "centimetres": 0.01,
@@ -78,12 +91,9 @@ def stream_layout(description: StreamDescription, settings: LslMarkersSettings) 
     if settings.names:
         found = _named_channels(description, settings.names, warnings)
     else:
-        found = _described_channels(description.channels, warnings)
-        if not description.channels:
-            warnings.append(
-                f"the stream describes none of its {description.channel_count} channels: set names "
-                "in [mocap] to the markers in their order, x y z each"
-            )
+        channels = _channels(description, settings, warnings)
+        order = _quaternion_order(description, settings)
+        found = _described_channels(channels, order, warnings)
 
     owners = {owner: 0 for owner, _, _ in found}
     entries: tuple[list[ModelEntry], list[ModelEntry]] = ([], [])
@@ -94,9 +104,9 @@ def stream_layout(description: StreamDescription, settings: LslMarkersSettings) 
         if not all(axis in parts for axis in _AXES):
             incomplete.append(name)
             continue
-        if "euler" in parts:
-            turned.append(name)
         whole = all(part in parts for part in _TURN)
+        if "euler" in parts or (not whole and any(part in parts for part in _TURN)):
+            turned.append(name)
         qw, qx, qy, qz = (parts.get(part, 0) for part in _TURN)
         x, y, z = (parts[axis] for axis in _AXES)
         owners[owner] += 1
@@ -113,8 +123,8 @@ def stream_layout(description: StreamDescription, settings: LslMarkersSettings) 
     if turned:
         warnings.append(
             f"rigid bodies {list_names(turned, _LISTED)} have Euler angles, whose order a stream "
-            "does not describe: they are used as markers; stream quaternions, or use markers in "
-            "[mocap]"
+            "does not describe, or an incomplete quaternion: they are used as markers; stream "
+            "quaternions, or use markers in [mocap]"
         )
     unit = _unit(description, settings, columns, warnings)
     return StreamLayout(
@@ -142,15 +152,47 @@ def _named_channels(
     }
 
 
-def _described_channels(channels: tuple[Channel, ...], warnings: list[str]) -> _Found:
+def _channels(
+    description: StreamDescription, settings: LslMarkersSettings, warnings: list[str]
+) -> tuple[Channel, ...]:
+    """Return the channels as the stream describes them, or with the labels of rig.toml."""
+    count = description.channel_count
+    if settings.labels:
+        if len(settings.labels) == count:
+            return tuple(Channel(label) for label in settings.labels)
+        warnings.append(
+            f"labels lists {len(settings.labels)} channels; the stream has {count}: correct labels "
+            "in [mocap]"
+        )
+    elif not description.channels:
+        warnings.append(
+            f"the stream describes none of its {count} channels: set names in [mocap] to the "
+            "markers in their order, x y z each; or labels to the label of every channel, such as "
+            "T1_X or Thigh_qw"
+        )
+    return () if settings.labels else description.channels
+
+
+def _quaternion_order(description: StreamDescription, settings: LslMarkersSettings) -> str:
+    """Return the components of the channels OrientationA to D."""
+    if settings.quaternion_order != "auto":
+        return settings.quaternion_order
+    return "xyzw" if description.manufacturer.lower() == _LAST_SCALAR else "wxyz"
+
+
+def _described_channels(
+    channels: tuple[Channel, ...], quaternion_order: str, warnings: list[str]
+) -> _Found:
     """Return the channels according to their descriptions in the stream."""
+    lettered = {f"q{at}": f"q{part}" for at, part in zip("abcd", quaternion_order, strict=True)}
     found: _Found = {}
     repeated: list[str] = []
     for number, channel in enumerate(channels):
         part = _TYPES.get(channel.type.lower(), "")
         by_label = _LABEL.fullmatch(channel.label)
-        if not part and by_label is not None and not channel.type.lower().startswith("orient"):
-            part = by_label["part"].lower()
+        if not part and by_label is not None and not channel.type.lower().startswith(_OTHER_TYPES):
+            part = _labelled_part(by_label)
+        part = lettered.get(part, part)
         name = channel.marker or channel.object
         if not name and by_label is not None:
             name = by_label["name"]
@@ -175,6 +217,16 @@ def _described_channels(channels: tuple[Channel, ...], warnings: list[str]) -> _
             "give every marker a name of its own in the camera software"
         )
     return found
+
+
+def _labelled_part(label: re.Match[str]) -> str:
+    """Return the component that the end of a label names; empty if it is of another quantity."""
+    if label["other"]:
+        return "euler" if label["other"].lower() == "euler" else ""
+    part = label["part"].lower()
+    if label["turn"]:
+        return f"q{part}"
+    return part if part != "w" else ""
 
 
 def _unit(

@@ -46,6 +46,8 @@ _BACKWARDS_NS = NS_PER_S
 _GAP_PERIODS, _LEAST_GAP_NS = 5, 100_000_000
 """Steps of the stamps of a regular stream, in periods and in ns. If both are exceeded, samples were
 lost. Programs that stamp samples at transmission have a jitter of several periods."""
+_REPEATED = 50
+"""Number of samples with the stamp of the sample before that causes a warning."""
 _EARLY_NS, _LATE_NS = 500_000_000, 10 * NS_PER_S
 """Largest times by which a stamp on the LSL clock may be later and earlier than its arrival, ns."""
 
@@ -73,6 +75,7 @@ class LslMarkersDecoder:
         self._trip: RoundTrip | None = None
         self._on_lsl_clock: bool | None = None  # None: not known yet
         self._zeros_reported = False
+        self._steps, self._repeated = 0, 0  # all steps of the stamps, and those of 0
         self.unpublished = 0
         """Number of samples that arrived before the description of the stream."""
         self.suspicious = 0
@@ -151,6 +154,7 @@ class LslMarkersDecoder:
         self._layout = layout
         self._unit_check = UnitCheck(layout.unit)
         self._trip, self._on_lsl_clock = None, None
+        self._steps, self._repeated = 0, 0
 
     # --- time ---------------------------------------------------------------------------------
 
@@ -189,7 +193,7 @@ class LslMarkersDecoder:
         )
 
     def _check_step(self, stamp_ns: int, out: list[Decoded]) -> None:
-        """Report lost samples of a regular stream, and a restart of the sender."""
+        """Report lost samples of a regular stream, repeated stamps, and a restart of the sender."""
         if self._last is None or self._description is None:
             return
         step_ns, rate_hz = stamp_ns - self._last[0], self._description.rate_hz
@@ -197,9 +201,22 @@ class LslMarkersDecoder:
             text = f"clock of the sender stepped by {step_ns / NS_PER_S:+.3f} s"
             out.append(DeviceEvent("restart", text, {"step_s": step_ns / NS_PER_S}))
             self._on_lsl_clock = None
-        elif rate_hz and step_ns > max(_GAP_PERIODS * NS_PER_S / rate_hz, _LEAST_GAP_NS):
+        self._count_repeated(step_ns, out)
+        if rate_hz and step_ns > max(_GAP_PERIODS * NS_PER_S / rate_hz, _LEAST_GAP_NS):
             lost = round(step_ns * rate_hz / NS_PER_S) - 1
             out.append(DeviceEvent("gap", f"{lost} samples lost", {"lost": lost}))
+
+    def _count_repeated(self, step_ns: int, out: list[Decoded]) -> None:
+        """Report once per connection that most samples have the stamp of the sample before."""
+        self._steps += 1
+        self._repeated += step_ns == 0
+        if step_ns == 0 and self._repeated == _REPEATED and 2 * self._repeated > self._steps:
+            text = (
+                f"{self._repeated} of {self._steps} samples have the time stamp of the sample "
+                "before, so they are duplicates: the program sends several samples at once; state "
+                "the nominal rate of the stream in the program, or send every sample alone"
+            )
+            out.append(DeviceEvent("warning", text))
 
     # --- samples ------------------------------------------------------------------------------
 

@@ -87,6 +87,7 @@ def _describe_server(lsl: Any, info: Any, wait_s: float) -> FoundServer:
         transport="unicast",
         bodies=bodies,
         markers=markers,
+        settings={"stream": info.name()},
     )
 
 

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.model import Chunk
+from jointfit_daemon.name_lists import list_names
 from jointfit_drivers.lsl_markers._library import compare_clocks, load_library, search_streams
 from jointfit_protocols.lsl import (
     FORMATS,
@@ -32,7 +33,7 @@ from jointfit_protocols.lsl import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from jointfit_daemon.driver import Emit
     from jointfit_drivers.lsl_markers._settings import LslMarkersSettings
@@ -48,8 +49,44 @@ _MOST_SAMPLES = 256
 """Largest number of samples in a chunk."""
 _BUFFER_S = 10
 """Duration of the samples that the library stores while this host does not read, s."""
+_OTHERS = 32
+"""Number of streams after which the search for streams that do not fit ends."""
+_LISTED = 8
+"""Largest number of streams in an error."""
 _FORMATS = dict(enumerate(("", "float32", "double64", "string", "int32", "int16", "int8", "int64")))
 """Names of the sample formats of liblsl, by number."""
+
+
+def _choices(streams: Sequence[Any]) -> str:
+    """Return a text that lists several streams that fit, and the keys that distinguish them."""
+    values = {
+        "stream": [info.name() for info in streams],
+        "source_id": [info.source_id() for info in streams],
+        "server": [info.hostname() for info in streams],
+        "stream_type": [info.type() for info in streams],
+    }
+    keys = [key for key, found in values.items() if len(set(found)) == len(found)]
+    keys = keys or [key for key, found in values.items() if len(set(found)) > 1]
+    listed = ", ".join(
+        f"{info.name()!r} of {info.hostname()} (source_id {info.source_id()!r})" for info in streams
+    )
+    remedy = " or ".join(keys) or "predicate"
+    return f"{len(streams)} streams fit: {listed}: set {remedy} in [mocap]"
+
+
+def _other_streams(streams: Sequence[Any]) -> str:
+    """Return a remedy for a missing stream, with the streams that the network has."""
+    others = [info for info in streams if not info.source_id().startswith("jointfit-")]
+    if others:
+        listed = list_names(
+            [f"{info.name()!r} of {info.hostname()} (type {info.type()!r})" for info in others],
+            _LISTED,
+        )
+        return f"; the network has {listed}: set stream in [mocap] to the one of the cameras"
+    return (
+        ": start the program that sends it, check the name (`jointfit probe --network` lists "
+        "streams), and that firewalls pass UDP 16571 and TCP 16572 to 16604"
+    )
 
 
 class LslSession:
@@ -159,27 +196,19 @@ class LslSession:
         while not self._stop.is_set():
             found = search_streams(lsl, settings.query(), settings.server, least=2, wait_s=_STEP_S)
             # A source that restarts may be announced twice. The newest announcement is the valid
-            # one.
+            # one. Programs may give all their streams, or those of every PC, the same source_id.
             newest = {
-                info.source_id() or info.uid(): info
+                (info.source_id() or info.uid(), info.name(), info.type(), info.hostname()): info
                 for info in sorted(found, key=lambda info: info.created_at())
             }
             if len(newest) > 1:
-                listed = ", ".join(
-                    f"{info.name()!r} of {info.hostname()} (source_id {info.source_id()!r})"
-                    for info in newest.values()
-                )
-                raise DeviceMisconfiguredError(
-                    f"{self._name}: {len(newest)} streams fit: {listed}: set stream, source_id or "
-                    "server in [mocap]"
-                )
+                raise DeviceMisconfiguredError(f"{self._name}: {_choices(list(newest.values()))}")
             if newest:
                 return next(iter(newest.values()))
             if time.monotonic() > until:
                 raise DeviceLostError(
-                    f"{self._name}: not found within {SEARCH_S:g} s: start the program that sends "
-                    "it, check the name (`jointfit probe --network` lists streams), and that "
-                    "firewalls pass UDP 16571 and TCP 16572 to 16604"
+                    f"{self._name}: not found within {SEARCH_S:g} s"
+                    + _other_streams(search_streams(lsl, "*", None, least=_OTHERS, wait_s=_STEP_S))
                 )
         return None
 
@@ -200,9 +229,9 @@ class LslSession:
         kind = _FORMATS.get(info.channel_format(), "")
         if kind not in FORMATS:
             raise DeviceMisconfiguredError(
-                f"{self._name}: {info.name()!r} has {kind or 'unknown values'}, expected numbers:"
-                " streams of type Markers are texts of events; set stream to that of the camera "
-                "software"
+                f"{self._name}: the values of {info.name()!r} have the format "
+                f"{kind or 'unknown'}, expected numbers: streams of type Markers are texts of "
+                "events; set stream to that of the camera software, or let it send numbers"
             )
         if info.channel_count() > MOST_CHANNELS:
             raise DeviceMisconfiguredError(

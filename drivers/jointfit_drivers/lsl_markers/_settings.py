@@ -43,6 +43,16 @@ class LslMarkersSettings(MocapSettings):
         description="names of the markers in the order of the channels, x y z each, for streams"
         " that do not describe their channels",
     )
+    labels: tuple[str, ...] = Field(
+        (),
+        description="label of every channel, such as T1_X, Thigh_qw or frame, for streams that do"
+        " not describe their channels, or describe them wrongly",
+    )
+    quaternion_order: Literal["auto", "wxyz", "xyzw"] = Field(
+        "auto",
+        description="components in the channels OrientationA to OrientationD; `auto`: xyzw in"
+        " streams of the manufacturer NaturalPoint, otherwise wxyz",
+    )
     time: Literal["lsl", "sender"] = Field(
         "lsl",
         description="clock of the time stamps: `lsl`: that of LSL on the sending PC; `sender`:"
@@ -72,6 +82,8 @@ class LslMarkersSettings(MocapSettings):
         for key in ("stream", "stream_type", "source_id"):
             if self.predicate is not None and getattr(self, key) is not None:
                 yield key, "predicate replaces this key: remove one of them"
+        if self.names and self.labels:
+            yield "names", "labels replaces this key: remove one of them"
         for name in sorted(set(self.names or ())):
             if self.names.count(name) > 1:
                 yield "names", f"{name!r} occurs twice: every marker needs a name of its own"

@@ -88,7 +88,11 @@ def _cameras(servers: Sequence[FoundServer]) -> Iterator[str]:
     from jointfit_daemon.driver import find_driver
 
     for server in servers[:1]:  # a rig has one camera system
-        keys: dict[str, Any] = {"driver": server.driver, "server": server.server}
+        keys: dict[str, Any] = {
+            "driver": server.driver,
+            "server": server.server,
+            **server.settings,
+        }
 
         # Write the command port if it differs from the driver's default.
         field = find_driver(server.driver).Settings.model_fields.get("command_port")

@@ -49,8 +49,15 @@ def labels(*names: str) -> list[str]:
 class Feeder:
     """A decoder of one stream, and everything that it returned."""
 
-    def __init__(self, channels: list[str], count: int | None = None, **settings: Any) -> None:
+    def __init__(
+        self,
+        channels: list[str],
+        count: int | None = None,
+        manufacturer: str = "",
+        **settings: Any,
+    ) -> None:
         table = {"driver": "lsl-markers", "up_axis": "z", **settings}
+        self.acquisition = f"<acquisition><manufacturer>{manufacturer}</manufacturer></acquisition>"
         self.decoder = LslMarkersDecoder(LslMarkersSettings.model_validate(table))
         self.items: list[Decoded] = []
         self.connect(channels, count)
@@ -63,7 +70,8 @@ class Feeder:
                 f"<info><name>Lab</name><type>MoCap</type><hostname>pc</hostname>"
                 f"<channel_count>{count or len(channels)}</channel_count>"
                 f"<nominal_srate>{self.rate}</nominal_srate>"
-                f"<channel_format>double64</channel_format><desc>{described}</desc></info>"
+                f"<channel_format>double64</channel_format><desc>{described}"
+                f"{self.acquisition}</desc></info>"
             ),
             T0_NS,
         )
@@ -176,6 +184,75 @@ def test_euler_angles_and_incomplete_markers_are_reported() -> None:
     assert feed(*(1.0,) * 8).layout.bodies == ()
 
 
+@pytest.mark.parametrize(
+    ("manufacturer", "order", "expected"),
+    [
+        ("PhaseSpace", "auto", [0.1, 0.5, 0.5, 0.7]),
+        ("NaturalPoint", "auto", [0.7, 0.1, 0.5, 0.5]),
+        ("NaturalPoint", "wxyz", [0.1, 0.5, 0.5, 0.7]),
+        ("", "xyzw", [0.7, 0.1, 0.5, 0.5]),
+    ],
+)
+def test_the_program_or_the_setting_decides_where_the_scalar_of_a_quaternion_is(
+    manufacturer: str, order: str, expected: list[float]
+) -> None:
+    feed = Feeder(body("Thigh"), manufacturer=manufacturer, quaternion_order=order)
+    frame = feed(1.0, 2.0, 3.0, 0.1, 0.5, 0.5, 0.7)
+    np.testing.assert_allclose(frame.body_orientations, [expected])
+
+
+@pytest.mark.parametrize("word", ["Quaternion", "Rotation", "Orientation"])
+def test_types_that_name_the_component_of_a_quaternion_are_read(word: str) -> None:
+    places = [channel(label="", object="Thigh", type=f"Position{axis}") for axis in "XYZ"]
+    turns = [channel(label="", object="Thigh", type=f"{word}{axis}") for axis in "XYZW"]
+    frame = Feeder([*places, *turns])(1.0, 2.0, 3.0, 0.5, -0.5, 0.5, 0.5)
+    np.testing.assert_allclose(frame.body_orientations, [[0.5, 0.5, -0.5, 0.5]])
+
+    feed = Feeder([*places, *turns[:3]])
+    assert "Thigh have Euler angles" in feed.texts("warning")
+
+
+def test_labels_of_another_quantity_are_no_positions() -> None:
+    turned = labels("A_quat_x", "A_quat_y", "A_quat_z", "A_quat_w", "A_pos_x", "A_pos_y", "A_pos_z")
+    frame = Feeder(turned)(0.5, -0.5, 0.5, 0.5, 1.0, 2.0, 3.0)
+    assert (frame.layout.markers, frame.layout.bodies) == ((), ("A",))
+    np.testing.assert_allclose(frame.body_positions, [[1.0, 2.0, 3.0]])
+    np.testing.assert_allclose(frame.body_orientations, [[0.5, 0.5, -0.5, 0.5]])
+
+    fast = labels("A_vel_x", "A_vel_y", "A_vel_z", "A_x", "A_y", "A_z")
+    frame = Feeder(fast)(9.0, 9.0, 9.0, 1.0, 2.0, 3.0)
+    np.testing.assert_allclose(frame.markers, [[1.0, 2.0, 3.0]])
+    typed = [channel(label=f"A_{axis}", marker="A", type=f"Velocity{axis}") for axis in "XYZ"]
+    frame = Feeder([*typed, *marker("A")])(9.0, 9.0, 9.0, 1.0, 2.0, 3.0)
+    np.testing.assert_allclose(frame.markers, [[1.0, 2.0, 3.0]])
+
+
+def test_labels_of_the_configuration_describe_bodies_and_other_channels() -> None:
+    named = ["frame", "A_x", "A_y", "A_z", "A_qx", "A_qy", "A_qz", "A_qw"]
+    frame = Feeder([], 8, labels=named)(77.0, 1.0, 2.0, 3.0, 0.5, -0.5, 0.5, 0.5)
+    np.testing.assert_allclose(frame.body_positions, [[1.0, 2.0, 3.0]])
+    np.testing.assert_allclose(frame.body_orientations, [[0.5, 0.5, -0.5, 0.5]])
+
+    wrong = Feeder([], 8, labels=named[:7])
+    assert "labels lists 7 channels; the stream has 8" in wrong.texts("warning")
+    assert "labels to the label of every channel" in Feeder([], 8).texts("warning")
+
+
+def test_samples_that_share_one_time_stamp_are_reported_once() -> None:
+    feed = Feeder(marker("T1"))
+    for chunk in range(10):
+        for _ in range(16):
+            feed(1.0, 2.0, 3.0, at_s=0.16 * chunk)
+    texts = feed.texts("warning")
+    assert texts.count("have the time stamp of the sample before") == 1
+    assert "state the nominal rate" in texts
+
+    rare = Feeder(marker("T1"))
+    for number in range(200):
+        rare(1.0, 2.0, 3.0, at_s=0.01 * (number - number % 3 // 2))
+    assert "time stamp of the sample before" not in rare.texts("warning")
+
+
 def test_markers_of_the_same_name_are_told_apart_by_their_object() -> None:
     one = [*marker("T1", object="Left"), *marker("T1", object="Right")]
     assert Feeder(one)(*range(1, 7)).layout.markers == ("Left/T1", "Right/T1")
@@ -248,5 +325,6 @@ def test_settings_that_contradict_each_other_are_refused() -> None:
 
     assert "predicate replaces this key" in fault(stream="a", predicate="name='a'")
     assert "'a' occurs twice" in fault(names=["a", "a"])
+    assert "labels replaces this key" in fault(names=["a"], labels=["a_x"])
     assert "both kinds of quotation marks" in fault(stream="a'\"")
     assert "expected one address or name" in fault(server="a b")

@@ -131,8 +131,16 @@ async def test_ended_connections_leave_no_tasks_threads_and_descriptors(lsl_netw
 async def test_two_sources_that_fit_are_listed(lsl_network: Any) -> None:
     name = f"twice {SOURCE}"
     pair = [server("T1", stream=name, source_id=f"{SOURCE}-{n}") for n in (1, 2)]
-    with pytest.raises(DeviceMisconfiguredError, match=r"2 streams fit: .*set stream, source_id"):
+    with pytest.raises(DeviceMisconfiguredError, match=r"2 streams fit: .*: set source_id in"):
         await LslMarkersMocap(settings(source_id=None, stream=name)).run(lambda _: None)
+    for one in pair:
+        one.unplug()
+
+
+async def test_streams_of_one_source_are_not_taken_for_one_stream(lsl_network: Any) -> None:
+    pair = [server("T1", stream=f"{kind} {SOURCE}") for kind in ("Markers", "Bodies")]
+    with pytest.raises(DeviceMisconfiguredError, match=r"2 streams fit: .*: set stream in"):
+        await LslMarkersMocap(settings()).run(lambda _: None)
     for one in pair:
         one.unplug()
 
@@ -141,8 +149,21 @@ async def test_a_missing_stream_has_a_remedy(
     lsl_network: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(_session, "SEARCH_S", 0.1)
+    monkeypatch.setattr(_session, "search_streams", lambda *_, **__: [])
     with pytest.raises(DeviceLostError, match=r"not found within 0\.1 s: start the program"):
         await LslMarkersMocap(settings(source_id="none")).run(lambda _: None)
+
+
+async def test_a_missing_stream_is_reported_with_those_of_the_network(
+    lsl_network: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_session, "SEARCH_S", 0.1)
+    monkeypatch.setattr(_session, "_LISTED", 100)
+    source = server("T1", stream=f"Nexus {SOURCE}")
+    named = rf"the network has .*'Nexus {SOURCE}' of .* \(type 'MoCap'\).*: set stream in"
+    with pytest.raises(DeviceLostError, match=named):
+        await LslMarkersMocap(settings(source_id="none")).run(lambda _: None)
+    source.unplug()
 
 
 async def test_search_and_diagnosis_name_the_content(lsl_network: Any) -> None:

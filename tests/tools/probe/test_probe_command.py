@@ -203,6 +203,18 @@ base = "jointfit/leg"
     assert (cameras.server, cameras.rigid_body) == ("192.168.1.2", {"thigh": "Thigh"})
 
 
+def test_the_lines_select_one_of_several_servers_at_an_address() -> None:
+    one, other = (
+        FoundServer(
+            "lsl-markers", "qtm-pc", 16572, "192.168.1.1", f"LSL stream {name}", "1.10", "LSL",
+            "unicast", settings={"stream": name},
+        )
+        for name in ("Markers", "Bodies")
+    )  # fmt: skip
+    table = tomllib.loads(_rig_lines.rig_lines([], [], [], [one, other]))["mocap"]
+    assert table == {"driver": "lsl-markers", "server": "qtm-pc", "stream": "Markers"}
+
+
 def test_keys_that_no_stream_shows_are_named_with_their_meaning() -> None:
     imu = DecodedDevice("lpms", {"baud": 115_200}, 99, 99, 100.0, 0)
     serial = [SerialTraffic("/dev/ttyUSB0", None, {115_200: 9}, 115_200, (imu,))]
