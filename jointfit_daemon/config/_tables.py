@@ -42,7 +42,7 @@ class RigTable(Settings):
     align_mode: Literal["smooth", "fast"] = Field(
         "smooth",
         description="`smooth` waits for samples before and after an instant and interpolates; "
-        "`fast` publishes one sample period earlier and extrapolates by at most that",
+        "`fast` publishes one sample period earlier and extrapolates by at most one period",
     )
 
 

@@ -44,7 +44,7 @@ frames."""
 FAULT_NS = 2_000_000_000
 """Time after which a fault begins or ends, ns."""
 MISFIT_NS = 4_000_000_000
-"""Time after which a cluster that fits no explanation is reported, ns."""
+"""Time after which a cluster is reported if no exchange of labels explains its misfit, ns."""
 _FEWEST = 7
 """Smallest number of frames with all clusters of a fault that permits a decision. They span more
 than half of `FAULT_NS`."""
@@ -54,7 +54,8 @@ frames."""
 _ABSENT = 0.1
 """Share of frames that a fault explains, or that do not fit, below which a fault or misfit ends."""
 _REFUSED = 0.8
-"""Share of unexplained frames that do not fit, above which a misfit is reported."""
+"""Smallest share of the frames with a body part in which its markers must not fit, so that a misfit
+is reported."""
 
 
 class _Examined(NamedTuple):

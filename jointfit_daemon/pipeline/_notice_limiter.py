@@ -1,8 +1,8 @@
 """Rate limit for notices about wires and clocks: one per minute, device and kind.
 
-A condition is reported when it begins. While it lasts, its totals are reported once a minute. Its
-end is reported after a minute without the condition. Lost samples are a warning if they exceed the
-share `MOST_LOST` of the samples in a minute.
+A condition is reported when it begins. While it lasts, its totals are reported once a minute. If it
+lasted for more than one report, its end is reported after a minute without the condition. Lost
+samples are a warning if they exceed the share `MOST_LOST` of the samples in a minute.
 
 Invariant: the sum of the totals in all notices equals the total number of events.
 """
@@ -138,7 +138,7 @@ def _totals(kind: str, condition: _Condition) -> dict[str, object]:
 
 
 def unix_step_notices(now_ns: int, step_ns: int) -> list[Notice]:
-    """Return the notice that UNIX time of this host was set forward by `step_ns`."""
+    """Return a notice that UNIX time of this host was changed by `step_ns`; none if it is small."""
     if abs(step_ns) < STEP_NS:
         return []
     step_s = step_ns / 1e9

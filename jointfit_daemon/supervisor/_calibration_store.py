@@ -37,7 +37,7 @@ class LoadedCalibration(NamedTuple):
     """Calibration of a rig, loaded from the store."""
 
     calibration: Calibration | None
-    """Newest stored calibration; None if the store contains no usable calibration."""
+    """Newest readable calibration; None if there is none, or if it does not fit the rig."""
     version: int | None
     """Number of the calibration in the store; None without a calibration."""
     warnings: tuple[str, ...]
@@ -55,7 +55,7 @@ def store_directory(rig: Rig) -> Path:
 
 
 def load_latest(rig: Rig) -> LoadedCalibration:
-    """Return the newest calibration that fits the rig's chain and sensors; report faults."""
+    """Return the newest readable calibration if it fits the rig's chain and sensors, else none."""
     try:
         latest = store_of(rig).latest()
     except (CalibrationFileError, OSError) as error:

@@ -39,8 +39,7 @@ SERVER_RETRY_S = 0.25
 """Longest wait before a retry of a source without a port, s. No device file shows that the server
 is available again, and an attempt costs only a few datagrams."""
 WORKED_S = 1.0
-"""Duration of data after which waits and pauses of a source start at their first values again,
-s."""
+"""Time with data after which the waits and pauses of a source return to their first values, s."""
 PAUSE_S = 60.0
 """Longest pause of a misconfigured source, s. A device may be reconfigured without being
 unplugged."""
@@ -80,9 +79,9 @@ class _SourceReporter:
     def report_end(
         self, reason: Literal["lost", "misconfigured"], text: str, *, absent: bool = False
     ) -> None:
-        """Report the end of the source, unless it is the same as the last report.
+        """Report the end of the source. Successive attempts with the same fault are reported once.
 
-        After the first report of an `absent` device, its further failed attempts are not reported.
+        After the first report of an `absent` device, further failed attempts are not reported.
         """
         self._known.set()
         repeated = text == self._reported or (absent and self._absent)
@@ -104,7 +103,7 @@ class _RunningSource:
     Attributes
     ----------
     known
-        Event that is set when the source has sent a chunk or was reported absent.
+        Event that is set when the source has sent a chunk, or its driver has ended.
     paused
         Whether the source is misconfigured and waits for another device.
     """
@@ -263,7 +262,7 @@ class SourceTasks:
         self._run(name, removed.source)
 
     async def wait_until_known(self, within_s: float) -> None:
-        """Wait until every source has sent a chunk or was reported absent; at most `within_s`."""
+        """Wait until every source has sent a chunk or its driver ended; at most `within_s`."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(within_s):
                 for each in list(self._running.values()):

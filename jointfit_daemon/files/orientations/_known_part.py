@@ -64,7 +64,7 @@ def write_known_orientations(path: Path, table: OrientationTable) -> WrittenTabl
 
 
 def complete_part(known: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return the largest part of a table without unknown cells, as rows and columns to keep.
+    """Return a part of a table without unknown cells, as the rows and columns to keep.
 
     A column is kept if it is known in at least `LEAST_KNOWN` of the rows with any known cell. A row
     is kept if all kept columns are known in it.

@@ -87,9 +87,10 @@ class TakeoverDetector:
 
 
 async def is_in_use(settings: MqttSettings, offline: bytes) -> bool:
-    """Return whether another daemon publishes below this base: a stored state, or a new message.
+    """Return whether another daemon publishes poses below this base.
 
     If a daemon ends without disconnecting, the broker keeps the state ``online`` for some seconds.
+    This state therefore only extends the wait for a pose.
 
     Raises
     ------

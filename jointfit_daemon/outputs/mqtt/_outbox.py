@@ -149,7 +149,7 @@ class Outbox:
     def requeue_state(self) -> None:
         """Queue all state again, because the broker may have lost it, and drop stream messages.
 
-        Responses and events whose acknowledgement is missing are queued again as well.
+        Responses, events and late messages without an acknowledgement are queued again as well.
         """
         for origin in reversed(self._unacknowledged.values()):
             if origin is not None:

@@ -1,4 +1,4 @@
-"""A socket that drops incoming MQTT packets above a size limit, and messages on other conditions.
+"""A socket that drops incoming MQTT packets above a size limit, and messages not admitted.
 
 Invariant: a packet above the limit occupies no memory, and a message that is not admitted is
 dropped before it is decoded. The class is necessary because paho buffers a whole packet before it

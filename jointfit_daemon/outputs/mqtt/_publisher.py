@@ -107,7 +107,8 @@ class MqttPublisher:
     outbox
         Messages to publish.
     on_request
-        Function that is called with each request that is not retained; it must not block.
+        Function that is called with each request, except retained requests and requests above the
+        permitted rate. It must not block.
     """
 
     def __init__(

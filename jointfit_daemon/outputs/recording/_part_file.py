@@ -154,7 +154,7 @@ class PartFile:
         next_sequence
             Sequence number of the first message after this file.
         reason
-            Reason why the file ends: ``rotated`` or ``stopped``.
+            Reason why the file ends: ``rotated``, ``stopped`` or ``recovered``.
 
         Raises
         ------

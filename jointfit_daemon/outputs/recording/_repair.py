@@ -1,6 +1,6 @@
 """Repair of a damaged or unfinished recording: its readable messages are copied to a clean file.
 
-Invariant: the source is not changed, and an incomplete copy is deleted.
+Invariant: the content of the source is not changed, and an incomplete copy is deleted.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 _COPYING = ".repair"
 """Suffix of the copy while it is being written."""
 DAMAGED = ".bad"
-"""Suffix given to the source after the repair if the source is damaged before its end."""
+"""Suffix given to an unfinished file that is damaged before its end, or that was repaired before.
+"""
 _FLUSH_MESSAGES = 4096
 """Number of messages between two writes."""
 _PAUSE_MESSAGES, _PAUSE_S = 32, 0.001

@@ -4,8 +4,9 @@ A line consists of the CRC-32 of the rest in hexadecimal digits, the topic relat
 the payload, separated by spaces. A process appends only to files that it created. A power cut can
 therefore damage only the last line of a file.
 
-Invariant: the total size exceeds `keep_bytes` by at most one file. When a new file is needed, the
-oldest file is deleted and its messages are counted. A line with a wrong CRC is counted and skipped.
+Invariant: after each write, the total size exceeds `keep_bytes` only if there is a single file.
+Otherwise the oldest files are deleted, and their messages are counted. A line with a wrong CRC is
+counted and skipped.
 """
 
 from __future__ import annotations
@@ -72,12 +73,12 @@ class SpoolFiles:
         return sum(self._sizes.values())
 
     def load(self) -> None:
-        """Find the files of earlier processes.
+        """Find the files of earlier processes, and delete files without a readable message.
 
         Raises
         ------
         OSError
-            The files cannot be read.
+            A file cannot be read or deleted.
         """
         if not self._folder.is_dir():
             return

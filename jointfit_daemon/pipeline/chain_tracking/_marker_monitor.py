@@ -129,7 +129,10 @@ class MarkerMonitor:
         self._labels.advance(t_ns)
 
     def update(self, t_ns: int, seen: NDArray[np.bool_]) -> list[MarkerReport]:
-        """Store which markers are visible in a frame, shape (M,)."""
+        """Store which markers are visible in a frame, shape (M,).
+
+        Return reports of markers that were hidden for `LOST_REPORT_NS`, or that are visible again.
+        """
         self._began_ns = t_ns if self._began_ns is None else self._began_ns
         reports = []
         for m, marker in enumerate(self.model.markers):

@@ -1,7 +1,7 @@
 """State of online learning: whether it is possible, and reason and duration of an obstacle.
 
-A lasting obstacle is reported once when it begins and once when it ends. If the subject is outside
-the view of the cameras, this is not an obstacle.
+An obstacle that lasts for `REPORT_NS` is reported once, and its end is reported once. If the
+subject is outside the view of the cameras, this is not an obstacle.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ class LearningMonitor:
         self._off = off
         self._mocap_ns: int | None = None
         self._usable_ns: int | None = None
-        """Instant of the last usable frame; before it, instant of the first frame."""
+        """Instant of the last frame that was usable or showed no marker; before such a frame, the
+        instant of the first frame."""
         self._obstacle: str | None = None
         self._in_view = False
         self._reported = False

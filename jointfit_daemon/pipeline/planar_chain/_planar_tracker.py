@@ -1,6 +1,6 @@
 """Joint positions and stick figure of a planar chain in operation.
 
-A joint connects two body parts. If a part has two markers, its coordinates are known. In these
+A joint connects two body parts. If a part has at least two markers, its pose is known. In its
 coordinates, each marker of the adjacent part moves on a circle about the joint. A running circle
 fit, in which older frames lose weight, estimates the center and predicts its error. A part at the
 end of the chain needs only one marker. Source: Akbarifar et al., Iranian Journal of Biomedical
@@ -100,7 +100,7 @@ class _Joint:
 
 
 class PlanarTracker:
-    """Estimates the joints between body parts with one or two markers.
+    """Estimates the joints between body parts, one of which has at least two markers.
 
     Parameters
     ----------

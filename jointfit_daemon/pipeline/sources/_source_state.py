@@ -1,7 +1,7 @@
 """State of one source in the core: decoder, clock and counters.
 
 The state converts chunks to stamped samples, and counts losses and errors. It does not depend on
-frames, calibration or other sources.
+frames or the calibration, and depends on other sources only through sync lines.
 """
 
 from __future__ import annotations

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Reply, ReplyAddress, Request
 
 Handler: TypeAlias = "Callable[[Request], Awaitable[Reply | None]]"
-"""Function that executes one request. It returns None if the core answers the request."""
+"""Function that executes one request. It returns None if the core answers the request, or if the
+function has already published the answer."""
 
 log = logging.getLogger(__name__)
 

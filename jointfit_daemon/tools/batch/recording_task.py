@@ -1,7 +1,7 @@
 """Processing of one recording of a batch, in this process or another.
 
-Invariant: the output files depend only on the bytes of the recording, the steps and the software
-version. All files become visible together, after all steps have succeeded.
+Invariant: the output files depend only on the bytes of the recording, the steps, the formats and
+the software version. All files become visible together, after all steps have succeeded.
 """
 
 from __future__ import annotations
@@ -178,7 +178,7 @@ def _calibrate(recording: Path, folder: Path, notes: list[str]) -> Calibration |
 
     try:
         found = calibrate_recording(recording)
-    except ReprocessingError as error:  # usual: no calibration
+    except ReprocessingError as error:  # many recordings contain no calibration
         notes.append(f"calibrate: {error}")
         return None
     if found.calibration is None:

@@ -167,7 +167,7 @@ class PhaseTracker:
             await self._next_message()
 
     async def wait_for_final(self, phase: str) -> Mapping[str, Any]:
-        """Return the first status after the end of `phase` in which its result is stored."""
+        """Return the status after the end of `phase`: aborted, stored, or after `STORING_S`."""
         while self.status is self._status_before or self.status.get("phase") in (phase, "fitting"):
             await self._next_message()
         ended = self.status

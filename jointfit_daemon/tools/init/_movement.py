@@ -33,7 +33,7 @@ _USUAL_BAUDS = (115_200, 921_600, 460_800, 230_400, 2_000_000)
 
 @dataclass
 class _Listener:
-    """One connected device, with its rotation or the reason why it sends no data."""
+    """One device to read, with its rotation or the reason why it sends no data."""
 
     table: dict[str, Any]
     reason: str = "no answer yet"
@@ -41,7 +41,7 @@ class _Listener:
     turned_rad: float = 0.0
 
     def take(self, q: tuple[float, ...]) -> None:
-        """Update the rotation angle between the first orientation and `q`."""
+        """Update the largest rotation from the first orientation with the orientation `q`."""
         if self.start is None:
             self.start = q
         dot = abs(sum(a * b for a, b in zip(self.start, q, strict=True)))
