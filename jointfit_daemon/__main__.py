@@ -26,7 +26,8 @@ log = logging.getLogger("jointfit_daemon")
 
 EXIT_BUG, EXIT_USAGE, EXIT_IN_USE = 1, 2, 3
 THREADS_TIMEOUT_S = 2.0
-"""Longest wait for threads at the end, s: name resolution cannot be interrupted."""
+"""Longest wait for threads at the end of the process, s. A thread that resolves a host name cannot
+be interrupted."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -111,7 +112,10 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _log_handler(rig: str, *, limited: bool) -> logging.Handler:
-    """Return the log handler: for the systemd journal, a service without journal, or a terminal."""
+    """Return the log handler for the destination of standard error.
+
+    The destination is the systemd journal, another output of a service, or a terminal.
+    """
     from jointfit_daemon.outputs.log import (
         JournalHandler,
         LevelFormatter,

@@ -1,7 +1,7 @@
-"""Optional abilities of drivers: to find devices, and to name the cause of missing data.
+"""Optional methods of drivers, which find devices or name the cause of missing data.
 
-``jointfit probe``, ``jointfit doctor`` and ``jointfit init`` call the methods of this module. A
-driver class may implement any of them; the commands skip drivers without the method.
+``jointfit probe``, ``jointfit doctor`` and ``jointfit init`` call these methods. A driver class may
+implement any of them; the commands skip drivers without the method.
 
 Invariant: this module names no device.
 """
@@ -30,7 +30,7 @@ class Finding:
     """Name of the device, interface or file; empty if the subject is the host."""
     level: Level
     text: str
-    """The state that was found, and the expected one."""
+    """State that was found, and state that was expected."""
     remedy: str = ""
     """Command or setting that removes the cause; empty if there is nothing to do."""
 
@@ -62,14 +62,14 @@ class FoundServer:
 
 
 class StreamSearch(Protocol):
-    """Search ability of a driver whose devices send byte streams."""
+    """Search attributes of a driver whose devices send byte streams."""
 
     usual_bauds: ClassVar[tuple[int, ...]]
     """Usual speeds of the devices, baud, the most frequent first."""
 
 
 class CanSearch(Protocol):
-    """Search ability of a driver whose devices send CAN frames."""
+    """Search method of a driver whose devices send CAN frames."""
 
     @classmethod
     def candidate_tables(cls, seen: Mapping[tuple[int, bool], int]) -> Iterable[Mapping[str, Any]]:
@@ -78,13 +78,13 @@ class CanSearch(Protocol):
         Parameters
         ----------
         seen
-            Number of data bytes of each received identifier. A key consists of the number of the
-            identifier and whether it has 29 bits.
+            Number of data bytes of the frames with each received identifier. A key consists of the
+            identifier and whether the identifier has 29 bits.
         """
 
 
 class ServerSearch(Protocol):
-    """Search ability of a driver for motion-capture servers."""
+    """Search method of a driver for motion-capture servers."""
 
     @classmethod
     async def find_servers(
@@ -95,11 +95,12 @@ class ServerSearch(Protocol):
         Parameters
         ----------
         hosts
-            Names or addresses of hosts to query. The answers include rigid bodies and markers.
+            Names or addresses of hosts to query. These hosts are also asked for the names of their
+            rigid bodies and markers.
         broadcast
             Whether to query all hosts in the networks of this host.
         port
-            Command port; None for the usual one.
+            Command port; None for the usual port.
 
         Raises
         ------
@@ -109,11 +110,11 @@ class ServerSearch(Protocol):
 
 
 class Diagnosis(Protocol):
-    """Ability of a driver to name the cause of missing data."""
+    """Method of a driver that names the cause of missing data."""
 
     @classmethod
     async def diagnose(cls, settings: Any, wait_s: float) -> list[Finding]:
-        """Return the findings for a table of rig.toml; `wait_s` limits the wait for data.
+        """Return the findings for the device of a table of rig.toml; `wait_s` limits the wait.
 
         The method opens the device in the same way as the daemon. Errors of the device become
         findings, not exceptions.

@@ -81,10 +81,10 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     def contradictions(self) -> Iterable[tuple[str, str]]:
-        """Yield the keys whose values do not fit together, each with the fault and its remedy.
+        """Yield each key whose value contradicts another value, with the fault and its remedy.
 
         Override this method instead of adding a model validator. The check of rig.toml also calls
-        it for tables with other faults; values that cannot be read are then None.
+        this method for tables with other faults; values that cannot be read are then None.
         """
         return ()
 
@@ -128,7 +128,7 @@ INTERFACE_NAME_EXPECTED = (
 
 
 def host_fault(host: str) -> str | None:
-    """Return why `host` is neither an IP address nor the name of a host, or None if it is one."""
+    """Return why `host` is neither an IP address nor a host name; None if `host` is valid."""
     with suppress(ValueError):
         ip_address(host)
         return None
@@ -145,12 +145,12 @@ _HOST_LABEL = re.compile(r"(?!-)[\w-]{1,63}(?<!-)")
 
 
 _NO_PORT = re.compile(r"(v|vx|sl)?can\d+|eth\d+|tty\w+|COM\d+", re.IGNORECASE)
-"""Names that are no path of a port: network interfaces, Windows ports, and device files without
-their folder."""
+"""Pattern of names that are often given instead of a path: network interfaces, Windows ports, and
+device files without their folder."""
 
 
 def port_path_fault(path: str) -> str | None:
-    """Return why `path` is not the device file of a serial port, or None if it may be one."""
+    """Return why `path` cannot be the device file of a serial port; None if it can be."""
     if not path.strip():
         return "must not be empty: expected a serial port, such as /dev/ttyUSB0"
     if _NO_PORT.fullmatch(path):
@@ -166,7 +166,7 @@ def is_interface_name(name: str) -> bool:
 
 
 class CanBusSettings(Settings):
-    """One ``[can.NAME]`` table: a bus for one or several devices."""
+    """One ``[can.NAME]`` table, which describes a bus with one or several devices."""
 
     # Other keys are passed to python-can.
     model_config = ConfigDict(frozen=True, extra="allow")
@@ -248,12 +248,15 @@ class ImuSettings(Settings):
 
     @property
     def serial_bits_per_s(self) -> float | None:
-        """Bit rate of the samples on a separate serial line, bit/s; None without a limit."""
+        """Bit rate that the samples need on a serial line, bit/s; None if no line limits them."""
         return None
 
     @property
     def can_frames(self) -> tuple[tuple[int, bool], ...]:
-        """CAN frames of one sample: number of data bytes, whether the identifier has 29 bits."""
+        """CAN frames of one sample.
+
+        Each is given by its number of data bytes and whether its identifier has 29 bits.
+        """
         return ()
 
 
@@ -287,9 +290,10 @@ class MocapSettings(Settings):
 
 
 def device_path(settings: object) -> str | None:
-    """Return the device file or interface of a driver: its `port`, or the channel of its bus.
+    """Return the device file or network interface in the settings of a driver.
 
-    Return None if the table has neither, for example for a network device.
+    It is the `port`, or the channel of the CAN bus. Without both, for example for a network device,
+    return None.
     """
     found = getattr(settings, "port", None) or getattr(
         getattr(settings, "can", None), "channel", None
@@ -300,8 +304,9 @@ def device_path(settings: object) -> str | None:
 class Decoder(Protocol):
     """The pure part of a driver. No input raises an exception.
 
-    Some decoders decode frames that they do not return. Such a decoder has three counters of type
-    int: ``unpublished`` (frames whose layout is not known yet), ``duplicates`` and ``late``.
+    Some decoders decode motion-capture frames that they do not return. Such a decoder counts these
+    frames in three attributes of type int: ``unpublished`` (frames whose layout is not known yet),
+    ``duplicates`` and ``late``.
     """
 
     @property
@@ -320,7 +325,10 @@ class Decoder(Protocol):
         """Return the items that `chunk` completes, in wire order."""
 
     def flush(self) -> list[Decoded]:
-        """Discard an incomplete message at the end of input, or after silence."""
+        """Discard an incomplete message at the end of input or after silence.
+
+        Return the items that the remaining bytes contain.
+        """
 
 
 class Driver(Protocol):
@@ -355,7 +363,10 @@ class UnknownDriverError(LookupError):
 
 
 def entry_points(*, group: str) -> EntryPoints:
-    """Return the entry points of a group. The search of `sys.path` takes 8 ms, so it is cached."""
+    """Return the entry points of a group.
+
+    The result is cached, because the search of `sys.path` takes 8 ms.
+    """
     return _entry_points_on(tuple(sys.path), group)
 
 

@@ -215,24 +215,26 @@ class Chain:
     sensors: tuple[tuple[str, ...], ...]
     """Sensor ids of each segment, in the order of ``segments``; at least one per segment."""
     left_side: bool = False
-    """Whether the limb is on the left side: adduction and rotation change sign (CONVENTIONS.md)."""
+    """Whether the limb is on the left side, where adduction and rotation have the opposite sign
+    (CONVENTIONS.md)."""
     origin: Vector | None = None
     """Fixed position of O1 in the world, m. If None, O1 is at the origin or at its optical
     position."""
     lengths: tuple[float | None, ...] = ()
     """Configured segment lengths, m; None if calibration estimates them."""
     proximal: str | None = None
-    """Body part proximal of O1, such as the pelvis, with markers only; None if there is none."""
+    """Body part proximal of O1, such as the pelvis, that has markers but no sensors; None without
+    such a part."""
     distal: str | None = None
-    """Body part distal of the last joint, such as the foot, with markers only; None if there is
-    none."""
+    """Body part distal of the last joint, such as the foot, that has markers but no sensors; None
+    without such a part."""
     static_axes: bool = False
     """Whether the segment axes equal the world axes in the static pose. If False, joint centres
     define the segment axes."""
     planar: bool = False
     """Whether the cameras alone measure a movement in a plane, without sensors and calibration."""
     conventions: tuple[AngleConvention | None, ...] = ()
-    """Configured angle conventions of the joints; None if the name of the joint selects it."""
+    """Configured angle convention of each joint; None if the name of the joint selects it."""
     parents: tuple[int | None, ...] = ()
     """Number of the proximal segment of each joint, None for O1. The tuple is empty for a limb
     without branches."""
@@ -333,7 +335,7 @@ class FrameFlag(StrEnum):
 
 
 class LimbState(NamedTuple):
-    """State of the limb at ``t_ns``: one per frame, even without sensors."""
+    """State of the limb at ``t_ns``. Every frame has one, even if no sensor has data."""
 
     seq: int
     t_ns: int
@@ -419,7 +421,7 @@ class RunningCenter(NamedTuple):
     arc: float
     """Range of the marker directions about the center, rad."""
     refused: str | None
-    """Reason why there is no center; None if there is one."""
+    """Reason why there is no center; None if `center` is given."""
     center: Vector | None = None
     """Position of the center, m."""
     covariance: tuple[Vector, Vector, Vector] | None = None
@@ -438,7 +440,7 @@ class RunningCenter(NamedTuple):
     p_value: float | None = None
     """Probability of a shift of this size by chance."""
     moved: bool | None = None
-    """Whether the center differs from the calibrated one."""
+    """Whether `p_value` is so small that the center counts as displaced; None if unknown."""
 
 
 class RunningCenters(NamedTuple):
@@ -515,7 +517,7 @@ class PlanarJoint(NamedTuple):
     """Arc of the markers about the joint, rad; the larger of the arcs of the two adjacent
     segments."""
     refused: str | None
-    """Reason why there is no position, with the remedy."""
+    """Reason why there is no position, with the remedy; None if `position` is given."""
 
 
 class Stick(NamedTuple):
@@ -536,9 +538,10 @@ class StickFigure(NamedTuple):
     normal: Vector | None
     """Unit normal of the plane of movement; None while it is unknown."""
     off_plane: float | None
-    """RMS distance of the markers from their planes, parallel to the plane of movement, m."""
+    """RMS distance of the markers from their planes of movement, m. The plane of each marker is
+    parallel to the plane of movement of the limb."""
     refused: str | None
-    """Reason why there is no plane of movement; None if there is one."""
+    """Reason why there is no plane of movement; None if `normal` is given."""
     joints: tuple[PlanarJoint, ...]
     sticks: tuple[Stick, ...]
 

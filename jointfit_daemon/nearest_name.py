@@ -16,8 +16,8 @@ _CUTOFF = 0.5
 """Least similarity, 0 to 1, of a suggested spelling: half of the characters agree."""
 
 _SHORT = 3
-"""Largest length, characters, of a name that counts as short. A name similar to a short name has
-the same first character, or the same characters in another order."""
+"""Largest length, characters, of a name that counts as short. For a short name, only names with the
+same first character, or with the same characters in another order, are suggested."""
 
 
 _OTHER_WORDS = {
@@ -63,8 +63,8 @@ _OTHER_WORDS = {
     "vertical": ("up_axis",),
     "zaxis": ("up_axis",),
 }
-"""Keys of rig.toml for each synonym. Synonyms are in lower case without separators. The first of
-these keys that the table permits is suggested."""
+"""Keys of rig.toml for each synonym. Synonyms are in lower case without separators. The suggestion
+is the first key of the synonym that the table permits."""
 
 
 def nearest_key(key: object, known: Iterable[str]) -> str | None:

@@ -1,4 +1,4 @@
-"""The table ``[imu.sensor_calibration]``: errors of one sensor, and their correction in readings.
+"""The table ``[imu.sensor_calibration]``, which contains the measured errors of one sensor.
 
 `jointfit calibrate sensor` writes the table. A driver whose settings have the key
 `sensor_calibration` corrects raw readings with this table before the orientations are computed.
@@ -28,7 +28,7 @@ LARGEST_CHANGE = 0.9
 
 
 class SensorCalibrationSettings(Settings):
-    """Errors of one sensor. The corrected vector is matrix · (measured - bias)."""
+    """Errors of one sensor. The corrected vector is matrix · (measured vector - bias)."""
 
     date: str = Field(
         pattern=r"^\d{4}-\d{2}-\d{2}$",
@@ -112,8 +112,8 @@ class CalibratableSettings(Protocol):
     def for_readings(self) -> Any:
         """Return settings whose decoder returns each uncorrected reading as a sample.
 
-        A sample contains angular rate and specific force. It contains the magnetic field if the
-        device sent it with this reading. Its orientation is the identity.
+        A sample contains angular rate and specific force. It also contains the magnetic field if
+        the device sent the field with this reading. The orientation of the sample is the identity.
         """
 
 

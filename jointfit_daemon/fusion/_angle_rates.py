@@ -39,8 +39,8 @@ class AngleRates:
         angles : JointAngles or None
             Angles in this frame, rad; None if unknown.
         gimbal : bool
-            Whether the joint is at gimbal lock. Rates are then unknown, and are computed again from
-            the frames that follow.
+            Whether the joint is at gimbal lock. The rates are then unknown. Later rates use only
+            frames after the gimbal lock.
         """
         past = self._past.get(joint)
         if past is None:

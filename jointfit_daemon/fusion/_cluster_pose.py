@@ -1,10 +1,10 @@
 """Pose of a marker cluster, and of points fixed to it, in single mocap frames.
 
-The fit equals the fit of ``limb_model.rigid_fit``, except for rounding. Quantities that do not
-change from frame to frame are computed once for each set of visible markers. The fit of a frame
-uses plain floats. For matrices this small the overhead of a NumPy call exceeds the time of the
-arithmetic. The overhead is several times larger if the processor caches no longer contain the code
-of NumPy.
+The result equals the result of ``limb_model.rigid_fit``, except for rounding. Quantities that do
+not change from frame to frame are computed once for each set of visible markers. The computation of
+a frame uses plain floats, because for matrices this small the overhead of a NumPy call exceeds the
+time of the arithmetic. The overhead is several times larger if the processor caches no longer
+contain the code of NumPy.
 
 The *static world* is the optical world as it was during the static pose.
 """

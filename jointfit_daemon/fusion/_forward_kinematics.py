@@ -138,7 +138,7 @@ def joint_angle_estimate(
     sign : float
         Sign of flexion about x, as defined in CONVENTIONS.md.
     left : bool
-        Whether the limb is on the left side.
+        Whether the joint is on the left side.
     correlation : float
         Correlation :math:`\rho`.
     convention : AngleConvention

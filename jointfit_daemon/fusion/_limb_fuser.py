@@ -76,7 +76,9 @@ class LimbFuser:
         self._chain, self._drifting = chain, drifting
         self.sensor_monitor = sensor_monitor or SensorMonitor(chain)
         self.worn = True
-        """Whether the sensors are on the body. On the calibration plate they are not compared."""
+        """Whether the sensors are on the body. Sensors on the calibration plate are not compared
+        with each other.
+        """
         usable = calibration is not None and calibration.fits(chain)
         self._uncorrected = calibration is not None and calibration.procedure == "patent"
         """Whether sensors are used without correction, even if they have faults."""
@@ -143,7 +145,7 @@ class LimbFuser:
             the state.
         orientations : mapping of str to Quaternion
             q_world_sensor of every sensor with data, each in its own world. Unknown sensors are
-            ignored. Must not be changed afterwards.
+            ignored. The caller must not change the mapping afterwards.
         extrapolated : frozenset of str
             Sensors whose orientation is extrapolated beyond their last sample.
         optical_origin : Vector, optional
@@ -206,7 +208,10 @@ class LimbFuser:
         return LimbState(seq, t_ns, completed_ns, mode, sync, tuple(flags), segments, joints)
 
     def replace_models(self, calibration: Calibration) -> None:
-        """Use the models of an otherwise equal calibration, with a fade of the output."""
+        """Use the models of an otherwise equal calibration from now on.
+
+        The output moves gradually to the orientations of the new models.
+        """
         if self._calibration is None:
             return
         self._calibration = calibration
@@ -270,8 +275,8 @@ class LimbFuser:
             for fuser, near in zip(self._fusers, self._neighbors, strict=True)
         ]
         if any(spread):
-            # Inconsistent sensors add an independent error; `sd` is its standard deviation per
-            # axis, rad.
+            # Inconsistent sensors add an error that is independent of other errors. `sd` is the
+            # standard deviation of this error per axis, rad.
             fused = [
                 one if one.sd is None else one._replace(sd=hypot(one.sd, sd), fault_sd=sd)
                 for one, sd in zip(fused, spread, strict=True)

@@ -1,8 +1,9 @@
 """Orientation of one segment from the sensors that have data.
 
-If a model was trained for exactly these sensors, the orientation is its prediction. Otherwise it is
-the mean of these sensors. Without sensors it is the last orientation for 0.2 s, then None. If the
-set of sensors changes, the output moves from the old to the new orientation within 0.25 s:
+If a model was trained for exactly these sensors, the output is the prediction of this model.
+Otherwise it is the mean of these sensors. Without sensors it is the last orientation for 0.2 s,
+then None. If the set of sensors changes, the output moves from the old to the new orientation
+within 0.25 s:
 
 - If a sensor returns, both sets have data, and their predictions are blended. The first sample of a
   returning sensor is often wrong, but its frame has a small weight.
@@ -52,10 +53,11 @@ FADE_NS = 250_000_000
 MODEL_FADE_NS = 1_000_000_000
 """Fade time after a change of the models by online learning, ns."""
 OUTLIER = radians(3.0)
-"""Change of the difference between two sets of sensors within three frames above which the last
-frame counts as wrong, rad. Soft-tissue artefact reaches a third of this threshold."""
+"""Largest distance, rad, between the difference of two sets of sensors in the last frame and the
+median of this difference in the last frames. With a larger distance the last frame counts as wrong.
+Soft-tissue artefact reaches a third of this threshold."""
 _HISTORY = 5
-"""Number of stored frames. The median of five frames is correct even if two are wrong."""
+"""Number of stored frames. The median of five frames is correct even if two frames are wrong."""
 HOLD_NS = 200_000_000
 """Time for which the last orientation is held if no sensor has data, ns."""
 MINUTE_NS = 60_000_000_000
@@ -112,8 +114,8 @@ class SegmentFuser:
         self._models = calibration.models
         self._replaced_models: Mapping[str, SegmentModel] | None = None
         self._chosen: dict[tuple[Names, Names], tuple[SegmentModel | None, Names]] = {}
-        """Chosen model and its neighbor sensors. The key is the sensors with data on the segment
-        and on the neighbor.
+        """Chosen model, and the sensors of the neighboring segment that this model uses. The key
+        contains the sensors with data on the segment and on the neighboring segment.
         """
         self._use(self._models)
         self._calibrated_ns: int | None = None
@@ -150,8 +152,8 @@ class SegmentFuser:
         t_ns : int
             Instant of the frame.
         inputs : dict
-            q_optical_segment of every sensor of the limb with data; the segment is the sensor's own
-            segment.
+            Orientation q_optical_segment computed from each sensor of the limb that has data. The
+            segment is the one to which the sensor is attached.
         neighbor : sequence of str
             Sensors of the neighboring segment, whose posture is an input of the models; must not
             change between calls.
@@ -281,7 +283,7 @@ class SegmentFuser:
         self._history.clear()
 
     def _blend_sets(self, t_ns: int, inputs: Inputs, target: Quaternion) -> Quaternion:
-        """Return the output, blended from the sets of sensors that are faded out to `target`."""
+        """Return the output, blended from old sets of sensors to the prediction `target`."""
         if self._blends:
             done = [k for k, one in enumerate(self._blends, 1) if t_ns - one.start_ns >= FADE_NS]
             if done:
@@ -318,9 +320,9 @@ def _present(names: Names, inputs: Inputs) -> Names:
 def mean_one(orientations: Sequence[Quaternion]) -> Quaternion:
     """Return the mean of orientations within 90° of each other, with equal weights.
 
-    The mean is the normalized sum of the quaternions, each with the sign of the first. For two
-    orientations it equals the eigenvector mean of Markley et al. (2007). For more orientations the
-    difference is of third order in their distances.
+    The mean is the normalized sum of the quaternions, with their signs aligned to the first. For
+    two orientations it equals the eigenvector mean of Markley et al. (2007). For more orientations
+    the two means differ by terms of third order in the distances of the orientations.
     """
     w, x, y, z = a, b, c, d = orientations[0]
     for p, i, j, k in orientations[1:]:

@@ -59,7 +59,8 @@ class JointCoordinates:
     coordinate is part of the state.
     """
     middle: int | None = None
-    """Index of the second of three successive rotations, which remains within 90 degrees."""
+    """Index of the second of three successive rotations, whose angle is limited to ±90 degrees;
+    None for other joints."""
 
 
 def default_coordinates(model: ChainModel) -> tuple[JointCoordinates, ...]:
@@ -122,7 +123,7 @@ class CoordinateTable:
     sd: Array
     """Standard deviations, rad and m, shape (T, K)."""
     misfit: dict[str, float]
-    """Largest rotation by segment that the coordinates do not describe, rad."""
+    """Largest rotation of each segment that its coordinates cannot describe, rad."""
 
 
 def coordinate_table(
@@ -255,9 +256,10 @@ def _pseudo_inverse(G: Array) -> Array:
 
 
 def _continuous(values: Array, is_angle: tuple[bool, ...], known: NDArray[np.bool_]) -> Array:
-    """Return values without jumps of 360 degrees between successive `known` rows, shape (T,).
+    """Return values without jumps of 360 degrees between successive known rows.
 
-    The median angle of these rows is within 180 degrees. Other rows are returned unchanged.
+    `known` is the mask of these rows, shape (T,). The median of each angle in these rows is within
+    180 degrees. Other rows are returned unchanged.
     """
     if not known.any():
         return values

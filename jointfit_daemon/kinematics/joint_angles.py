@@ -4,9 +4,9 @@ r"""Joint angles from the rotation between two segments.
 
 R is the matrix of this quaternion; its indices start at 0. CONVENTIONS.md defines segment axes (x
 to the right, y anterior, z proximal) and signs. Angles are in rad. q and -q have the same angles.
-`AngleConvention` selects the three angles of a joint. If two axes of a sequence coincide, the two
-angles are not unique. One angle is then set to 0, the other contains the whole rotation, and the
-frame is flagged as gimbal-locked.
+`AngleConvention` selects the three angles of a joint. If two axes of a sequence coincide, the
+angles about these axes are not unique. One of them is then set to 0, the other contains the whole
+rotation, and the frame is flagged as gimbal-locked.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def joint_rotation(q_proximal: ArrayLike, q_distal: ArrayLike) -> Array:
 
 
 def swing_twist(q_joint: ArrayLike, axis: ArrayLike) -> tuple[Array, Array]:
-    r"""Split a rotation into a twist about `axis` of the distal frame, then a swing normal to it.
+    r"""Split a rotation into a twist about `axis` and a swing about an axis normal to `axis`.
 
     .. math:: \mathrm{twist} = 2\,\mathrm{atan2}(q_v \cdot a, q_0), \qquad
               \mathrm{swing} = q_j \otimes \mathrm{twist}^*
@@ -48,8 +48,9 @@ def swing_twist(q_joint: ArrayLike, axis: ArrayLike) -> tuple[Array, Array]:
     Parameters
     ----------
     q_joint : array_like, shape (..., 4)
+        Rotation q_proximal_distal.
     axis : array_like, shape (3,)
-        Unit vector.
+        Unit vector in the distal frame.
 
     Returns
     -------
@@ -65,9 +66,10 @@ def swing_twist(q_joint: ArrayLike, axis: ArrayLike) -> tuple[Array, Array]:
 
 
 def functional_axis(q_joint: ArrayLike) -> Array:
-    """Return the principal rotation axis of a joint as a unit vector to the right, shape (3,).
+    """Return the principal rotation axis of a joint as a unit vector, shape (3,).
 
     The axis is the first right singular vector of the rotation vectors of `q_joint`, shape (n, 4).
+    Its sign is selected so that the x component is not negative.
     """
     axis: Array = np.linalg.svd(rotation.log(q_joint), full_matrices=False)[2][0]
     return -axis if axis[0] < 0.0 else axis

@@ -27,22 +27,23 @@ if TYPE_CHECKING:
 _LEAST_FRAMES = 10
 """Smallest number of frames with enough markers."""
 _UNIT_FACTOR = 100.0
-"""Size ratio of trial and model above which the length unit must be wrong."""
+"""Size ratio of trial to model above which the length unit must be wrong."""
 _MOST_STRETCH = 1.3
-"""Size ratio of trial and model above which the refinement is refused."""
+"""Size ratio of trial to model above which the refinement is refused."""
 _NOTED_STRETCH = 1.1
-"""Size ratio of trial and model above which a note is returned."""
+"""Size ratio of trial to model above which a note is returned."""
 _APART_M = 0.04
-"""Smallest distance between markers of one segment that is compared, m."""
+"""Smallest distance of two markers of one segment that is used for the size ratio, m."""
 MOST_RMS_M = 0.08
-"""Tracking error above which labels, scaling or axes must be wrong, m."""
+"""RMS marker error of a trial above which labels, scaling or axes must be wrong, m."""
 _FAR_M = 0.025
 """Distance from the model position above which a marker may have the label of another marker, m."""
 _SWAP_LEAST_M = 0.05
-"""Smallest root of the summed squared distances of exchanged markers, m."""
-_SWAPPED_TRIAL = 0.5
-"""Fraction of frames with exchanged labels above which the whole trial counts as labelled wrongly.
+"""Smallest root of the summed squared distances of the markers of a group from their model
+positions, m. With a smaller value the group does not count as exchanged.
 """
+_SWAPPED_TRIAL = 0.5
+"""Smallest fraction of frames with exchanged labels with which the whole trial is refused."""
 _ROBUST = IkOptions(huber_m=0.02, reweightings=4)
 
 
@@ -75,7 +76,8 @@ def check(
         faults.append(
             "all coordinates are locked: nothing to refine"
             if model.locked.all()
-            else "no unlocked marker can be refined: each is locked, unseen or alone on its segment"
+            else "no marker can be refined: each is locked, has weight 0, is missing in the"
+            " training trials, or is the only one on its segment"
         )
 
     if faults:
@@ -121,7 +123,7 @@ def find_trial_faults(
     if not 1.0 / _MOST_STRETCH < stretch < _MOST_STRETCH:
         return [
             f"{trial.name}: {stretch:.2f} times as large as the model: scale the model first,"
-            " or refinement would hide it"
+            " otherwise the refinement would hide the wrong scale"
         ]
 
     return []
@@ -143,7 +145,7 @@ def _stretch(model: ChainModel, trial: MotionTrial) -> float:
 def _movable(
     model: ChainModel, trials: Sequence[MotionTrial]
 ) -> tuple[NDArray[np.bool_], list[str]]:
-    """Return the coordinates that the trials determine, and notes on the other coordinates."""
+    """Return the coordinates that the trials determine, and notes on markers that stay fixed."""
     seen = np.zeros(len(model.markers), dtype=np.bool_)
     for trial in trials:
         seen |= np.isfinite(trial.targets).all(axis=-1).any(axis=0)
@@ -157,9 +159,12 @@ def _movable(
     notes = []
     absent = [m.name for m, there in zip(model.markers, seen, strict=True) if not there]
     if absent:
-        notes.append(f"in no training trial, position kept: {', '.join(absent)}")
+        notes.append(
+            "position kept, because the marker is in no training trial or has weight 0:"
+            f" {', '.join(absent)}"
+        )
     notes += [
-        f"{m.name}: the only marker on {m.segment}, so its position is not observable: kept"
+        f"{m.name}: the only marker on {m.segment}, so its position is not observable and is kept"
         for m, only in zip(model.markers, alone, strict=True)
         if only and not all(m.locked)
     ]
@@ -167,7 +172,7 @@ def _movable(
 
 
 def _gaps(model: ChainModel, trials: Sequence[MotionTrial]) -> list[str]:
-    """List the markers that are missing in some of the trials."""
+    """Return a note for each trial that lacks markers which another trial contains."""
     present: NDArray[np.bool_] = np.array(
         [np.isfinite(t.targets).all(axis=-1).any(axis=0) for t in trials]
     )
@@ -185,7 +190,10 @@ def _gaps(model: ChainModel, trials: Sequence[MotionTrial]) -> list[str]:
 
 
 def _labels(model: ChainModel, trial: MotionTrial) -> tuple[MotionTrial, list[str], list[str]]:
-    """Return the trial without frames of exchanged labels, notes, and faults."""
+    """Return the trial, notes, and faults.
+
+    In the trial, exchanged markers are missing (NaN) in the frames of the exchange.
+    """
     found = solve_frames(model, trial.targets, options=_ROBUST)
     if not (trial.targets.shape[0] and np.isfinite(found.residuals).any()):
         return (
@@ -199,7 +207,7 @@ def _labels(model: ChainModel, trial: MotionTrial) -> tuple[MotionTrial, list[st
         if frames.mean() >= _SWAPPED_TRIAL:
             faults.append(f"{text}: correct their labels")
         else:
-            notes.append(f"{text} in {frames.sum()} frames: left out")
+            notes.append(f"{text} in {frames.sum()} frames: they are ignored in these frames")
             targets[frames[:, None] & np.isin(np.arange(targets.shape[1]), group)] = np.nan
 
     rms = tracking_error(found.residuals)
@@ -213,10 +221,10 @@ def _labels(model: ChainModel, trial: MotionTrial) -> tuple[MotionTrial, list[st
 
 
 def exchanged_markers(residuals: Array, targets: Array) -> dict[tuple[int, ...], NDArray[np.bool_]]:
-    """Return groups of markers that fit much better after an exchange of labels, and the frames.
+    """Return groups of markers that fit much better after an exchange of labels.
 
-    In each group every marker is at the position of the next marker, and the last marker is at the
-    position of the first.
+    The value of each group is the mask of the frames with this exchange. In each group every marker
+    is at the position of the next marker, and the last marker is at the position of the first.
     """
     places = targets + residuals  # positions in the model
     own = np.einsum("tmi,tmi->tm", residuals, residuals)
@@ -231,7 +239,10 @@ def exchanged_markers(residuals: Array, targets: Array) -> dict[tuple[int, ...],
 
 
 def exchange_text(model: ChainModel, group: tuple[int, ...]) -> str:
-    """Return a text on exchanged markers, with the position of each if there are more than two."""
+    """Return a text on exchanged markers.
+
+    For a group of more than two, the text names the marker at whose position each marker is.
+    """
     names = [model.markers[i].name for i in group]
     if len(names) == 2:
         return f"{names[0]} and {names[1]} look exchanged"

@@ -1,7 +1,9 @@
 """Align phase, in which a plate with all sensors and with markers is rotated by hand.
 
 The rotation from each sensor world to the optical world is estimated only in this phase, never from
-skin-mounted sensors. Parameters that the movement did not excite are rejected with the reason.
+skin-mounted sensors. If the movement does not determine the full rotation, only the heading is
+estimated, with a note. If it does not determine the heading either, the phase fails with the
+reason.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion
 
 MIN_FRAMES = 200
-"""Smallest number of frames with plate and sensor."""
+"""Smallest number of frames in which the sensor has data and the plate is visible."""
 MAX_RMS = np.deg2rad(6.0)
 """Largest residual, rad. A larger residual indicates a loose sensor, a sensor that is not on the
 plate, or swapped markers.
@@ -164,7 +166,9 @@ def fit_plate_alignment(
 def plate_track(
     optical: OpticalTrack, settings: CalibrationSettings
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return time stamps, ns, shape (n,), and q_optical_plate, shape (n, 4), NaN if not visible.
+    """Return time stamps, ns, shape (n,), and q_optical_plate, shape (n, 4).
+
+    q_optical_plate is NaN in frames in which the plate is not visible.
 
     Raises
     ------
@@ -202,8 +206,8 @@ def _align_one(
     both = np.flatnonzero(visible(q_sensor) & visible(q_plate))
     if both.size < MIN_FRAMES:
         raise CalibrationError(
-            f"{name}: {both.size} frames together with the plate, at least {MIN_FRAMES} are needed;"
-            " check that the sensor streams and the plate is in view"
+            f"{name}: in {both.size} frames the sensor has data and the plate is visible, at least"
+            f" {MIN_FRAMES} are needed; check that the sensor streams and the plate is in view"
         )
 
     every = both[:: -(-both.size // MAX_FRAMES)]

@@ -6,14 +6,15 @@ predicts the relation of a pair. The pairs are:
 * pairs on one segment (:mod:`jointfit_daemon.fusion.faults._slip`),
 * pairs across a hinge (:mod:`jointfit_daemon.fusion.faults._joint_heading`).
 
-A difference that appears within seconds is a slip, or a magnetic disturbance if it is a rotation
-about the vertical. A difference about the vertical that grows over minutes is heading drift.
-Heading errors are removed from the sensors before fusion. Only differences are observable. The
-drifts of the segments are therefore defined to have the mean 0, and so are the drifts of the
-sensors of each segment.
+A deviation from the predicted relation that appears within seconds is a slip, or a magnetic
+disturbance if it is a rotation about the vertical. A deviation about the vertical that grows over
+minutes is heading drift. Heading errors are removed from the sensors before fusion. Only
+differences of headings are observable. The drifts of the segments are therefore defined to have the
+mean 0, and so are the drifts of the sensors of each segment.
 
-If the difference of a pair is larger than soft tissue can cause, the soft-tissue model does not
-apply. Both sensors are then rotated by equal amounts until the difference has its usual size.
+If the deviation of a pair is larger than soft tissue can cause, the soft-tissue model does not
+apply. Both sensors are then rotated towards each other by equal angles until the deviation has its
+usual size.
 
 Invariant: the cost per frame is O(1).
 """
@@ -49,15 +50,16 @@ UPDATE_NS = 39_000_000
 """Interval of the comparisons, ns. With frames at 100 Hz it results in 25 comparisons per second.
 """
 SUDDEN_SD = radians(2.0)
-"""Change of a segment's standard deviation between two comparisons above which the next frame is
-compared as well, rad. One wrong sample therefore affects one frame instead of a whole interval.
+"""Change of a segment's standard deviation between two comparisons, rad. After a larger change the
+next frame is compared as well, so that one wrong sample affects one frame instead of a whole
+interval.
 """
 MIN_DRIFT = radians(0.2)
 """Smallest heading drift that is corrected, rad."""
 REPORTED_DRIFT = radians(5.0)
 """Heading drift that is reported, rad."""
 MAJORITY = 3
-"""Fewest sensors on a segment among which a slipped sensor can be identified."""
+"""Smallest number of sensors on a segment with which the slipped sensor can be identified."""
 MOST_PAIRED = 5
 """Largest number of sensors on a segment for which every pair is compared. The number of pairs
 grows with the square of the number of sensors.
@@ -139,7 +141,8 @@ class ConsistencyMonitor:
         self._preceding = {n: group[:k] for group in chain.sensors for k, n in enumerate(group)}
         """Sensors that are listed before each sensor of the same segment."""
         self._corrections: dict[str, Quaternion] = {}
-        """Rotation of each sensor, in segment axes, that reduces the differences of its pairs."""
+        """Rotation applied to each sensor, in segment axes, which reduces the deviations of its
+        pairs."""
         self._consistent = [True] * len(chain.segments)
         """Whether all pairs of each segment are consistent."""
         self._all_consistent = True
@@ -163,7 +166,7 @@ class ConsistencyMonitor:
         return corrected
 
     def correct_pairs(self, inputs: Inputs) -> Inputs:
-        """Return the orientations with pair differences limited; call after ``update``."""
+        """Return the orientations with limited deviations of the pairs; call after ``update``."""
         if not self._corrections:
             return inputs
         corrected = inputs.copy()
@@ -238,7 +241,8 @@ class ConsistencyMonitor:
             pair.clear_excess()
             return ()
 
-        # With the wrong posture of a slipped neighbor this pair would appear inconsistent as well.
+        # The posture from a slipped sensor of the neighboring segment would make this pair appear
+        # inconsistent as well.
         near = None
         for neighbor in link.near:
             if neighbor in verticals:
@@ -254,7 +258,7 @@ class ConsistencyMonitor:
             drift.add_measurement(
                 pair.heading + self._sensor_drift[link.b] - self._sensor_drift[link.a]
             )
-        for name in self._preceding[link.a]:  # differences must form a forest
+        for name in self._preceding[link.a]:  # the differences must form a forest
             if name in inputs:
                 return ()
         return (HeadingDifference(link.a, link.b, pair.heading, link.spread),)
@@ -275,7 +279,7 @@ class ConsistencyMonitor:
             residual = heading - joint.standing - expected
             residual -= tau * round(residual / tau)
             differences.append(HeadingDifference(link.a, link.b, residual, sd))
-            if consistent:  # one link represents all links of the joint
+            if consistent:  # if the sensors of each segment agree, one link is sufficient
                 break
         if not differences:
             return []
@@ -301,7 +305,7 @@ class ConsistencyMonitor:
         return corrections.get(b, 0.0) - corrections.get(a, 0.0) if corrections else 0.0
 
     def _is_tilted(self, *sensors: str) -> bool:
-        """Return whether a pair of any of the sensors is inconsistent in more than heading."""
+        """Return whether one of the sensors belongs to a pair that deviates not only in heading."""
         return not self._all_consistent and any(
             pair.tilted and (pair.link.a in sensors or pair.link.b in sensors)
             for consistent, pairs in zip(self._consistent, self._pairs, strict=True)
@@ -321,7 +325,7 @@ class ConsistencyMonitor:
     # --- heading drift, once a second --------------------------------------------------------
 
     def _distribute_drifts(self) -> None:
-        """Compute the drift of each sensor from sums of pair drifts, with mean 0."""
+        """Compute the drift of each sensor from the drifts of pairs and joints, with mean 0."""
         along = [0.0]
         for inner, joint in zip(self._inner, self._joints, strict=True):
             along.append(along[inner.proximal] + (joint.drift.heading if joint.links else 0.0))
@@ -393,7 +397,10 @@ class ConsistencyMonitor:
         return spread, slipped, flags
 
     def _slipped_sensor(self, i: int, inputs: Inputs) -> str | None:
-        """Return the sensor that contradicts all others of its segment if the others agree."""
+        """Return the sensor that contradicts all other sensors of its segment, or None.
+
+        The other sensors must agree with each other.
+        """
         group = self._chain.sensors[i]
         present = [name for name in group if name in inputs] if len(group) >= MAJORITY else []
         if len(present) < MAJORITY:

@@ -35,7 +35,7 @@ BIAS_S = 15.0
 START_SD = radians(1.0)
 """Standard deviation of the headings just after a static pose, rad."""
 OUTLIER_SIGMA = 5.0
-"""Innovations beyond this many standard deviations are rejected; slips and restarts cause them."""
+"""Largest accepted innovation, in standard deviations. Slips and restarts cause larger ones."""
 
 
 class HeadingDriftFilter:
@@ -59,8 +59,8 @@ class HeadingDriftFilter:
         self.sd = START_SD
         """Standard deviation of the estimated heading error, rad."""
         self.observed_sd = max(START_SD, 0.6 * spread)
-        """Standard deviation that is reached with regular measurements, rad. The residuals of the
-        calibration already contain this error.
+        """Standard deviation of the estimate with regular measurements, rad. The residuals of the
+        calibration already contain an error of this size.
         """
         self.rejected = 0
         """Number of consecutive intervals whose mean was rejected as an outlier."""

@@ -1,9 +1,9 @@
 """Monitoring of the relative heading of two neighboring segments that a hinge joint connects.
 
-The flexion axis of a hinge is common to both segments, so the two headings of this axis must agree.
-Slow drift is estimated by :mod:`jointfit_daemon.fusion.faults._heading_drift`. A change within
-seconds is a fault and is reported. The part of the change that other modules do not correct is
-added to the uncertainty.
+The flexion axis of a hinge is common to both segments. Its heading can be computed from either
+segment, and the two results must agree. A slow drift of their difference is estimated by
+:mod:`jointfit_daemon.fusion.faults._heading_drift`. A change within seconds is a fault and is
+reported. The part of the change that other modules do not correct is added to the uncertainty.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.limb_model import SensorLink
 
 HINGE_SPREAD = radians(6.0)
-"""Largest standard deviation between the flexion axes of both segments at a hinge, rad. The part
-that depends on posture is removed first. Headings across a joint with a larger value are not
-compared.
+"""Largest standard deviation of the heading between the flexion axes of both segments at a hinge,
+rad. The part of this heading that depends on posture is removed first. At a joint with a larger
+standard deviation, headings are not compared.
 """
 LIMIT_SIGMA = 3.0
 """Heading difference at which two segments are inconsistent, in standard deviations of
@@ -55,7 +55,7 @@ class JointHeadingMonitor:
         self.links = [link for link in links if link.spread <= HINGE_SPREAD]
         self.standing = standing
         self._uncertain = bool(self.links) or drifts
-        """Whether the drift is measured, or grows without being measured."""
+        """Whether the headings may drift; the drift is measured only if there are links."""
         spread = max((link.spread for link in self.links), default=HINGE_SPREAD)
         self.drift = HeadingDriftFilter(spread)
         self._sd = spread
@@ -63,7 +63,8 @@ class JointHeadingMonitor:
         self._residual = self._corrected = 0.0
         self._before_ns: int | None = None
         self.difference = 0.0
-        """Smoothed heading difference, without drift, of the pair of sensors that agrees best, rad.
+        """Smoothed heading difference, without drift, rad. It is the difference of the pair of
+        sensors that agrees best.
         """
 
     @property

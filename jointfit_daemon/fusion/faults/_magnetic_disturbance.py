@@ -1,18 +1,19 @@
 r"""Detection and correction of magnetic disturbances, which change headings within seconds.
 
-A ferromagnetic object near a sensor with magnetometer changes its heading within seconds. The
-heading returns when the object is removed. Heading differences are measured between pairs on one
-segment and pairs across a hinge. The sum of these differences is the heading :math:`h_i` of each
-sensor relative to the first. The deviation of this heading from the weighted median is corrected;
-every segment has the same weight:
+A ferromagnetic object near a sensor with magnetometer changes the heading of the sensor within
+seconds. The heading returns when the object is removed. Heading differences are measured in pairs
+of sensors on one segment and across a hinge. The heading :math:`h_i` of each sensor relative to the
+first sensor is a sum of these differences. The deviation of this heading from the weighted median
+is corrected; every segment has the same weight:
 
 .. math:: o_i = h_i - \mathrm{median}(h), \qquad
           \text{correction: } o_i \cdot \mathrm{clip}\bigl((|o_i| - s_0) / (s_1 - s_0), 0, 1\bigr)
 
-If one of four sensors is disturbed, it is identified and corrected, and the others are unchanged.
-If two halves of the sensors contradict each other, the median is an interval. The middle of the
-interval is used, which preserves joint angles. Half the width of the interval is the uncertainty of
-all headings.
+Here :math:`s_0` and :math:`s_1` are ``CORRECTION_START`` and ``CORRECTION_FULL``, multiplied by the
+standard deviation of a difference without disturbance. If one of four sensors is disturbed, it is
+identified and corrected, and the others are unchanged. If two halves of the sensors contradict each
+other, the median is an interval. Deviations are then measured from the middle of the interval,
+which preserves joint angles. Half the width of the interval is the uncertainty of all headings.
 
 Only differences are observable, so a disturbance that rotates all sensors equally is not detected.
 """
@@ -32,15 +33,15 @@ CORRECTION_S = 0.25
 """Time constant with which corrections approach their targets, s, so that the output does not jump.
 """
 STALE_NS = 500_000_000
-"""Longest time without a measurement after which a smoothed difference continues, ns. After a
-longer time the difference restarts from 0.
+"""Longest time between two measurements of a smoothed difference, ns. After a longer time the
+difference restarts from 0.
 """
 CORRECTION_START = 1.6
 """Deviation from the median at which the correction starts, in standard deviations."""
 CORRECTION_FULL = 3.2
 """Deviation above which the correction is complete, in standard deviations."""
 NEGLIGIBLE = 0.002
-"""Correction below which a disturbance that ended is dropped, rad."""
+"""Correction below which the correction of an ended disturbance is removed, rad."""
 MIN_SD = 0.026
 """Smallest standard deviation of a difference, rad. It is 1.5 degrees."""
 
@@ -123,9 +124,10 @@ class MagneticDisturbanceDetector:
         return self._follow(t_ns, targets, ambiguity)
 
     def outlier(self, a: str, b: str) -> tuple[str, float] | None:
-        """Return the corrected sensor of a pair and its deviation, if the other sensor agrees.
+        """Return the disturbed sensor of a pair and its deviation, rad, or None.
 
-        The other sensor agrees if its deviation is less than half as large.
+        The disturbed sensor is corrected, and the deviation of the other sensor is less than half
+        as large.
         """
         deviations = self._deviations
         larger = abs(deviations.get(a, 0.0)) > abs(deviations.get(b, 0.0))
@@ -170,8 +172,7 @@ class MagneticDisturbanceDetector:
                 correction = _ramp(heading - middle, sd)
                 if correction:
                     targets[name] = correction
-                    # The same object may disturb the other sensors by an amount that is not
-                    # observed.
+                    # The same object may also disturb the other sensors, too little to be observed.
                     ambiguity = max(ambiguity, min(abs(correction), sd))
             ambiguity = max(ambiguity, _ramp(0.5 * (high - low), sd))
         return targets, ambiguity
@@ -220,6 +221,9 @@ def _weighted_median(weighted: list[tuple[float, float]]) -> tuple[float, float]
 
 
 def _ramp(angle: float, sd: float) -> float:
-    """Return the part of a deviation that is corrected, from none if small to all if large."""
+    """Return the part of a deviation that is corrected, rad.
+
+    It is 0 for a small deviation and the whole deviation for a large one.
+    """
     share = (abs(angle) / sd - CORRECTION_START) / (CORRECTION_FULL - CORRECTION_START)
     return angle * min(max(share, 0.0), 1.0)

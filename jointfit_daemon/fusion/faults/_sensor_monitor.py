@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 SensorState = Literal["absent", "ok", "lost", "stuck"]
 
 REPORT_DELAY_NS: dict[SensorState, int] = {"lost": 200_000_000, "ok": 2_000_000_000}
-"""Duration of a state after which it is reported, ns; other states are reported immediately."""
+"""Duration of a state after which the state is reported, ns; other states are reported immediately.
+"""
 
 
 class SensorReport(NamedTuple):

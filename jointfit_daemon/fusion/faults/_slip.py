@@ -1,9 +1,10 @@
 """Detection of sensor slip by comparing pairs of sensors of one segment with the calibration.
 
 The calibration predicts the rotation between two sensors of a segment from posture
-(`limb_model.SensorLink`). A difference beyond the usual residual increases the uncertainty
-immediately. The pair is reported as inconsistent only if the difference persists. It is reported as
-consistent after the difference has been well below the limit for a longer time.
+(`limb_model.SensorLink`). The *difference* of the pair is the measured minus the predicted rotation
+vector. If it exceeds the usual difference, the uncertainty increases immediately. The pair is
+reported as inconsistent only if the difference stays above a limit. It is reported as consistent
+again after the difference has been well below the limit for a longer time.
 """
 
 from __future__ import annotations
@@ -27,17 +28,17 @@ ONSET_NS = 500_000_000
 RELEASE_NS = 2_000_000_000
 """Time below the release limit after which the pair is consistent again, ns."""
 LIMIT_FACTOR = 2.4
-"""Limit of the smoothed difference in units of its usual RMS length. Sensors without fault stay
-below 1.5 for hours with simulated soft tissue. They stay below 2.1 in recorded movements outside
-the training range.
+"""Limit of the smoothed difference in units of its usual RMS length. Without a fault the smoothed
+difference stays below 1.5 for hours with simulated soft tissue. It stays below 2.1 in recorded
+movements outside the training range.
 """
 MIN_LIMIT = radians(6.0)
 """Smallest limit, rad."""
 RELEASE_SHARE = 0.65
 """Fraction of the limit below which an inconsistency may end."""
 TILT_SHARE = 0.75
-"""Fraction of the limit up to which a difference without its heading part may be soft-tissue
-artefact.
+"""Fraction of the limit, for the part of a difference that is not a rotation about the vertical. Up
+to this fraction the part may be soft-tissue artefact.
 """
 USUAL_FACTOR = 1.5
 """Largest usual difference of a single frame, in units of its RMS length."""
@@ -48,11 +49,11 @@ MEAN_S = 1.0
 RECENT_FRAMES = 10
 """Number of updates over which sudden changes are measured: 0.4 s."""
 UNTRAINED_SD = radians(5.0)
-"""Standard deviation per component, rad, of the difference of a pair without training movement."""
+"""Standard deviation per component of the difference of a pair that has no training data, rad."""
 
 
 def untrained_link(a: str, b: str) -> SensorLink:
-    """Return the link of a pair of which only the static pose is known; it predicts no rotation."""
+    """Return the link of a pair without training data; it always predicts the rotation 0."""
     zero = (0.0,) * 10
     return SensorLink(a, b, "pair", (), (zero, zero, zero), zero, zero, 0.0, UNTRAINED_SD)
 
@@ -128,13 +129,16 @@ class SlipDetector:
         self.limit = MIN_LIMIT
         """Distance above which the pair is inconsistent, rad."""
         self.excess = 0.0
-        """Part of the last corrected difference that exceeds the usual difference, rad."""
+        """Largest excess, rad, of the last difference, of its change within 0.4 s, or of the mean
+        difference over the usual value."""
         self.excess_vector: Vector = (0.0, 0.0, 0.0)
-        """Excess as the rotation vector from a to b in segment axes, rad; valid if `exceeded`."""
+        """Excess of the last difference as the rotation vector from a to b in segment axes, rad;
+        valid if `exceeded`."""
         self.exceeded = False
         """Whether the last difference was larger than usual."""
         self.heading = 0.0
-        """Vertical component of the last difference from a to b, rad."""
+        """Vertical component of the last difference from a to b, before the correction of magnetic
+        disturbances, rad."""
 
     @property
     def inconsistent(self) -> bool:
@@ -143,7 +147,7 @@ class SlipDetector:
 
     @property
     def tilted(self) -> bool:
-        """Whether a present or pending inconsistency is more than a heading difference."""
+        """Whether an active or pending inconsistency is not only a difference in heading."""
         return not self.consistent and hypot(*self._tilt) > TILT_SHARE * self.limit
 
     @property
@@ -173,7 +177,8 @@ class SlipDetector:
         a, b : Quaternion
             q_world_segment computed from each sensor.
         verticals : tuple of Vector
-            The vertical in the frame of `a` and in the frame of the neighboring segment.
+            The vertical in the frame of `a` and in the frame of the neighboring segment; the second
+            is None if unknown.
         correction : float
             Correction of the heading from a to b that `a` and `b` already contain, rad.
         """
@@ -193,7 +198,7 @@ class SlipDetector:
 
         self._smooth_differences(t_ns, uncorrected, residual, tilt, usual=usual)
 
-        # The excess of the current frame, of the mean, and of the recent change.
+        # The excess is the largest of three values: of this frame, of the mean, and of the change.
         length = hypot(*residual)
         beyond = max(0.0, length - USUAL_FACTOR * usual)
         self.exceeded = beyond > 0.0

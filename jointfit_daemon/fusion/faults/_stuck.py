@@ -3,15 +3,15 @@
 A sensor is stuck if either
 
 * it repeats its orientation while another sensor turns, or
-* it rotates by less than a small fraction of a large rotation of its partner on the same segment.
+* it hardly rotates while its partner, another sensor on the same segment, rotates far.
 
-A working sensor may also repeat its value, because of coarse resolution or a slow filter. The usual
-duration of such repetitions is estimated from repetitions that ended without a fault. A stuck
+A working sensor may also repeat its value, because of coarse resolution or a slow filter. The
+*natural repetition time* of a sensor is the longest repetition that ended without a fault. A stuck
 sensor is used again after 0.2 s of movement.
 
-Sensors without noise do not start or stop moving in the same frame. Their sampling instants differ,
-and a delayed sample is extrapolated from rest. Only the part of a repetition in which another
-sensor varied therefore counts.
+Sensors without noise do not start or stop moving in the same frame, because their sampling instants
+differ, and because a delayed sample is extrapolated from rest. Only the part of a repetition in
+which another sensor varied therefore counts.
 
 Invariant: only rotations of a sensor relative to its own earlier orientation are compared. The
 result therefore does not depend on the alignment or the world of the sensor. The cost per frame is
@@ -33,13 +33,16 @@ if TYPE_CHECKING:
 REPEAT_NS = 50_000_000
 """Shortest repetition that can count as stuck, ns."""
 REPEAT_AT_REST_NS = 400_000_000
-"""Repetition of a sensor at rest that counts as stuck if another sensor still varies, ns."""
+"""Shortest repetition of a sensor at rest that counts as stuck if another sensor still varies, ns.
+"""
 OBSERVATION_NS = 5_000_000_000
-"""Time at rest after which the noise of a sensor is known, ns."""
+"""Shortest time from the first sample of a sensor to a repetition at rest that counts as stuck, ns.
+Before, it is not known whether the sensor has noise.
+"""
 NATURAL_FACTOR = 3
 """Repetitions up to this multiple of the natural repetition time are no fault."""
 NATURAL_LIMIT_NS = 150_000_000
-"""Largest natural repetition time that is learned, ns. A longer time would hide a fault."""
+"""Largest natural repetition time that is used, ns. A longer time would hide a fault."""
 PARTNER_ROTATION = radians(1.0)
 """Rotation of a sensor on the same segment that a working sensor always follows, rad."""
 OTHER_ROTATION = radians(10.0)
@@ -53,13 +56,14 @@ WINDOW_NS = 150_000_000
 WINDOW_ROTATION = radians(6.0)
 """Rotation of a partner within one window that starts a comparison, rad."""
 FOLLOWED_SHARE = 0.05
-"""Fraction of the partner's rotation that even a loosely attached sensor follows. The rotation must
-be smaller in two consecutive windows, because a sensor may return to its start within one window.
+"""Fraction of `WINDOW_ROTATION` that even a loosely attached sensor rotates. A sensor is stuck if
+it rotates by less in two such windows in a row. One window is not sufficient, because the sensor
+may return to its start within this window.
 """
 RECOVERY_NS = 200_000_000
 """Duration of movement after which a stuck sensor is used again, ns."""
 _ROUNDING = 1e-12
-"""Squared sine of half a rotation of 2e-6 rad, below which a rotation is a rounding error."""
+"""Squared sine of half the angle 2e-6 rad. A smaller rotation is a rounding error."""
 
 
 class _SensorHistory:
@@ -132,8 +136,8 @@ class StuckSensorDetector:
         self._items = tuple(self._sensors.items())
         self._window: tuple[int, Orientations] | None = None
         self._varying_ns: tuple[int, int] | None = None
-        """First and last instant of the period in which sensors varied without a pause of all
-        sensors.
+        """First and last instant of the current period of variation, ns. A period ends if no sensor
+        varies for `REPEAT_AT_REST_NS`.
         """
 
     def update(self, t_ns: int, orientations: Orientations) -> list[str]:
@@ -145,7 +149,7 @@ class StuckSensorDetector:
             Instant of the frame; increases from call to call.
         orientations : mapping of str to Quaternion
             Orientation by sensor, each in its own world. The detector keeps a reference, so the
-            caller must not change it.
+            caller must not change the mapping.
         """
         repeating, varying = [], False
         for name, sensor in self._items:

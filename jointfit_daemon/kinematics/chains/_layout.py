@@ -33,8 +33,8 @@ class ChainLayout:
     free: Index | slice
     """Indices of the free segments."""
     corners: Array
-    """Transforms to the parent at zero rotation, without the joint centers in segment axes; shape
-    (S, 4, 4)."""
+    """Translations to the joint centers in the axes of the parents, as transforms of shape (S, 4,
+    4)."""
     has_own_centers: bool
     """Whether a joint center differs from the origin of its segment."""
     center: Array
@@ -58,8 +58,8 @@ class ChainLayout:
     moves: Array
     """Matrix with 1 where a degree of freedom moves a segment, shape (S, nq)."""
     lower: Array
-    """Matrix, shape (nq, nq), with 1 if the column is not after the row, and its segment is the
-    segment of the row or an ancestor of this segment.
+    """Matrix, shape (nq, nq), with 1 where the column index is at most the row index, and the
+    segment of the column is the segment of the row or one of its ancestors.
     """
     strictly_lower: Array
     """Matrix `lower` without its diagonal."""

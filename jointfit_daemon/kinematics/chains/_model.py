@@ -8,8 +8,8 @@ pose of its parent p,
 R is a rotation to the world, t an origin, and c the joint center in parent (p) and segment (i). The
 joint rotation :math:`A_i` of a ``ball`` joint is arbitrary. For a ``hinge`` it is
 :math:`A_{rest}\exp(a\theta)` with axis a and angle θ. A ``free`` joint has an arbitrary rotation
-and origin. One coordinate of a ``coupled`` joint moves :math:`A_i` and :math:`c_p` along a path.
-Axes and centers are in segment axes, in metres.
+and origin. A ``coupled`` joint has one coordinate, which moves :math:`A_i` and :math:`c_p` along a
+path. Axes and centers are in segment axes, in metres.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Joint:
     """Unit axis of a hinge in segment axes. Positive rotations about it are right-handed."""
     rest: Quaternion = (1.0, 0.0, 0.0, 0.0)
     """Rotation q_parent_segment of a hinge at angle zero. For a ball joint it is the initial
-    rotation of a search without data.
+    rotation of the search if no markers determine the rotation.
     """
     limits: tuple[float, float] | None = None
     """Least and greatest angle of a hinge, or coordinate of a coupled joint, rad. None if
@@ -105,9 +105,9 @@ class ChainModel:
     Raises
     ------
     InvalidChainModelError
-            Duplicate names, unknown parents or segments, parents after children, a free joint with
-        a parent, axes or rest rotations of other than unit length, empty limits, or values that are
-        not finite.
+        Duplicate names, unknown parents or segments, parents after children, a free joint with a
+        parent, axes or rest rotations that do not have unit length, empty limits, or values that
+        are not finite.
     """
 
     segments: tuple[Segment, ...]

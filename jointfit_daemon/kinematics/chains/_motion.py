@@ -35,7 +35,7 @@ _EYE = np.eye(3)
 
 @dataclass(frozen=True, slots=True)
 class ChainState:
-    """Joint positions of a chain at T instants."""
+    """State of all joints of a chain at T instants."""
 
     rotations: Array
     """A_i = R_parent_segment (R_world_segment without a parent), shape (T, S, 3, 3)."""

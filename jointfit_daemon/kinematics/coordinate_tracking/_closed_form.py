@@ -86,7 +86,7 @@ def closed_form(joint: JointCoordinates, kind: JointKind) -> ClosedForm | None:
     joint
         Coordinates of the joint, and the pose of the joint as a function of these coordinates.
     kind
-        Joint of the chain.
+        Kind of the joint in the chain.
     """
     angles = [k for k, is_angle in enumerate(joint.is_angle) if is_angle]
     shifts = [k for k, is_angle in enumerate(joint.is_angle) if not is_angle]

@@ -45,7 +45,8 @@ _CLOSE = 1e-3
 is about the square of the distance.
 """
 _SETTLED = 1e-4
-"""Largest last step, rad and m, of a joint whose coordinates describe only a part of the pose."""
+"""Step, rad and m, below which the search ends for a joint whose coordinates describe only a part
+of the pose."""
 _FARTHEST_MISFIT = 0.5
 """Largest rotation that the coordinates of a joint may leave undescribed, rad. A larger rotation
 indicates a wrong solution."""
@@ -90,7 +91,8 @@ class NumericInversion:
         last
             Values at the preceding instant, for each joint that was solved.
         """
-        # Known joints are processed first. The other joints share the remaining steps in turn.
+        # Joints with values at the preceding instant are processed first. The other joints share
+        # the remaining steps in turn.
         self._turn += 1
         numbers = sorted(poses)
         searching = [i for i in numbers if i not in last]
@@ -111,7 +113,7 @@ class NumericInversion:
     def _step(
         self, i: int, A: Array, origin: Array, last: Array | None
     ) -> tuple[Array, Array] | None:
-        """Take one step; return values and derivative if the step reaches the pose, or None."""
+        """Take one step; return values and derivative if the step reaches the pose, else None."""
         joint = self._joints[i]
         values = self._open.get(i)
         if values is None:
@@ -177,7 +179,8 @@ def _take_step(
     to_R = np.concatenate((A[None], R[1 + count :]))
     between = R[: 1 + count].swapaxes(-1, -2) @ to_R
 
-    # sin(x) replaces x, which is accurate for the small rotations of the last steps
+    # The sine replaces the rotation angle, which is accurate for the small rotations of the last
+    # steps.
     steps = np.zeros((1 + count, 6))
     steps[:, :3] = 0.5 * (between[:, (2, 0, 1), (1, 2, 0)] - between[:, (1, 2, 0), (2, 0, 1)])
     if len(origin):

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
 _LOCKED = 1e-3
 """Cosine of the second of three rotations below which the other two rotations are almost
-indistinguishable. In this case the values of the preceding instant are used.
+indistinguishable. In this case the coordinates are searched numerically, starting from the values
+of the preceding instant.
 """
 _NO_OFFSET_M = 1e-12
 _Row = tuple[float, float, float]
@@ -42,7 +43,7 @@ class CoordinateTracker:
 
     The result equals the result of `coordinate_table`. The coordinates of joints with a closed form
     are computed in closed form. For other joints a numerical search starts from the preceding
-    values. Until the search ends, their coordinates are unknown.
+    values. Until the search ends, the coordinates of these joints are unknown.
 
     Parameters
     ----------
@@ -121,8 +122,8 @@ class CoordinateTracker:
         Returns
         -------
         values, sd
-            Arrays with angles within ±180°. They contain NaN for a joint whose pose the coordinates
-            do not describe.
+            Arrays with angles within ±180°. They contain NaN for a joint whose search has not
+            ended, for example because its coordinates cannot describe the pose.
         """
         values, rates = np.full(len(self._last), np.nan), self._rates.copy()
         for i, c in zip(self._coupled, self._couplings, strict=True):
@@ -252,10 +253,10 @@ _NONE = np.zeros(0)
 
 
 def _three_angles(M: list[list[float]]) -> _Angles:
-    """Return the angles of M = Rx Ry Rz, and their derivatives by a step in rotated axes.
+    """Return the angles of M = Rx Ry Rz, and their derivatives with respect to a step.
 
-    The step is in the axes after all three rotations. The result is NaN if the second rotation is
-    90°.
+    The step is in the axes after all three rotations. The angles are NaN if the second rotation is
+    almost ±90°.
     """
     (m00, m01, sine), (_, _, m12), (_, _, m22) = M
     cosine = hypot(m00, m01)

@@ -50,12 +50,12 @@ _HOPELESS = 1e6
 _RIDGE = 1e-10
 """Absolute damping, for degrees of freedom without information."""
 _STILL = 1e-8
-"""Step below which it counts as a rounding error, rad and m."""
+"""Step, rad and m, below which an instant has converged, because only rounding errors remain."""
 
 
 @dataclass(frozen=True, slots=True)
 class Band:
-    """Allowed range of joint rotations, with the weight of the excess."""
+    """Allowed range of joint rotations, with the weight of the excess over this range."""
 
     reference: ChainState
     """State with A_ref, at T instants or at one instant."""
@@ -104,7 +104,10 @@ def limits_of(model: ChainModel, weight: float) -> tuple[Band, ...]:
 
 
 def log_matrix(R: Array) -> Array:
-    """Return rotation vectors (..., 3), rad, of matrices (..., 3, 3); undefined direction at pi."""
+    """Return rotation vectors, rad, shape (..., 3), of matrices, shape (..., 3, 3).
+
+    At the angle pi the direction of the vector is undefined.
+    """
     v = 0.5 * np.stack(
         (R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]),
         axis=-1,
@@ -181,12 +184,15 @@ class PoseSolution:
 
 
 def find_poses(problem: PoseProblem, start: ChainState) -> PoseSolution:
-    """Return the minimum from `start`, with robust weights if configured."""
+    """Return the poses with the lowest cost, searched from `start`.
+
+    The weights are robust if `PoseProblem.huber_m` is given.
+    """
     found = _descend(problem, start)
     if problem.huber_m is None:
         return found
 
-    # reduced weights of errors above the Huber threshold move the minimum slightly
+    # Errors above the Huber threshold get smaller weights, which move the minimum slightly.
     iterations = found.iterations
     for _ in range(problem.reweightings):
         errors = problem.at(found.state)[0].errors

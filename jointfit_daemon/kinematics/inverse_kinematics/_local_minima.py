@@ -102,7 +102,7 @@ def restart_local_minima(
         )
         best.try_from(probes, start)
 
-    # stop at an instant if the start from its neighbor does not reduce the cost
+    # Start the neighbors of improved instants from the improved poses, while the cost decreases.
     last = np.flatnonzero(best.improved)
     for _ in range(_PASSES):
         ahead = [(last + s, last) for s in (-1, 1)]

@@ -6,10 +6,10 @@ With the twists :math:`S_k=(\alpha_k,\beta_k)` of the degrees of freedom, a mark
 .. math:: I = \sum_m w_m \begin{pmatrix} |x|^2 1 - x x^T & [x]_\times \\ -[x]_\times & 1
           \end{pmatrix}
 
-The sum is over the markers m that both k and l move, with position x and weight w. One sum over
-markers per instant is needed. All other operations are only on segments and degrees of freedom, as
-in the composite rigid body algorithm with markers as masses. Source: Featherstone, Rigid Body
-Dynamics Algorithms, 2008, section 6.2.
+The sum is over the markers m that both degrees of freedom, k and l, move. A marker has the position
+x and the weight w. Only one sum over markers per instant is needed. All other operations are on
+segments and degrees of freedom, as in the composite rigid body algorithm with markers as masses.
+Source: Featherstone, Rigid Body Dynamics Algorithms, 2008, section 6.2.
 
 Internally the markers of each segment are stored in K slots, shape (T, S, 3, K). Empty slots have
 the weight zero.
@@ -47,19 +47,19 @@ class MarkerSlots:
         return self.points.shape[0], self.points.shape[2]
 
     def to_slots(self, values: Array) -> Array:
-        """Return (T, M) as (T, S, K), zero in empty slots."""
+        """Return values of shape (T, M) in slots, shape (T, S, K), zero in empty slots."""
         out = np.zeros((len(values), self.shape[0] * self.shape[1]))
         out[:, self.places] = values
         return out.reshape(len(values), *self.shape)
 
     def vectors_to_slots(self, values: Array) -> Array:
-        """Return (T, M, 3) as (T, S, 3, K), zero in empty slots."""
+        """Return vectors of shape (T, M, 3) in slots, shape (T, S, 3, K), zero in empty slots."""
         out = np.zeros((len(values), self.shape[0] * self.shape[1], 3))
         out[:, self.places] = values
         return np.ascontiguousarray(out.reshape(len(values), *self.shape, 3).swapaxes(-1, -2))
 
     def from_slots(self, slots: Array) -> Array:
-        """Return (T, S, 3, K) as (T, M, 3)."""
+        """Return vectors in slots, shape (T, S, 3, K), in the order of the markers, (T, M, 3)."""
         flat = slots.swapaxes(-1, -2).reshape(len(slots), -1, 3)
         return np.asarray(flat[:, self.places])
 

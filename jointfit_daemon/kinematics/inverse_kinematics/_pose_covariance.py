@@ -42,7 +42,8 @@ def pose_covariance(model: ChainModel, found: IkResult) -> tuple[Array, NDArray[
         Covariance of a step from the true state, rad^2 and m^2, shape (T, nq, nq).
     determined
         Mask, shape (T, nq). It is False if the information about a degree of freedom, while all
-        others are free, is less than the information of one marker 2 cm from the axis.
+        other degrees of freedom are free, is less than the information of one marker 2 cm from its
+        axis.
     """
     w = found.weights
     seen = np.where(np.isfinite(found.residuals).all(axis=-1), w, 0.0) > 0.0

@@ -57,8 +57,8 @@ _OPEN_SLACK = 1e-2  # tolerance, because the regularization may increase the mar
 _FORGETTING = 0.02
 _FIRST_SD_M = 0.003
 _FIRST_INSTANTS = 5
-"""Number of instants to which the initial standard deviation is equivalent in the estimate of the
-marker error.
+"""Weight of the initial standard deviation in the estimate of the marker error, as a number of
+instants.
 """
 _MOST_PATIENCE = 32
 """Largest number of restart intervals between two restarts of a chain that does not fit its
@@ -110,7 +110,8 @@ class LivePose:
     """Covariance of the step from the true state, rad^2 and m^2, shape (nq, nq)."""
     determined: NDArray[np.bool_]
     """Mask of the degrees of freedom that the markers determine, shape (nq,). The information about
-    them, while all others are free, is at least that of one marker 2 cm from the axis.
+    such a degree of freedom, while all others are free, is at least the information of one marker
+    2 cm from its axis.
     """
     underdetermined: bool
     """Whether the markers do not determine a degree of freedom, which then keeps its last value."""
@@ -264,9 +265,9 @@ class LiveInverseKinematics:
         return np.asarray(weights * np.minimum(1.0, limit / (np.sqrt(square) + 1e-12)))
 
     def _equations(self, place: _Place, reference: ChainState) -> _Equations:
-        """Return normal matrix and gradient.
+        """Return the normal equations at a state.
 
-        Both are regularized toward `reference` if the markers do not determine a degree of freedom.
+        They are regularized toward `reference` if the markers do not determine a degree of freedom.
         """
         lower, gradient = lower_equations(self._slots, place.at)
         H, g = lower[0], gradient[0]

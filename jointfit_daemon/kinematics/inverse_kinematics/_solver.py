@@ -6,9 +6,9 @@ At every instant
 
 is computed by the Levenberg-Marquardt method, where x are marker positions of the model, y measured
 positions and w weights. All instants are solved in parallel, each with its own damping. Missing
-markers (NaN) have no weight. If the markers do not determine a degree of freedom at an instant, the
-instant is reported. A second pass solves these instants in order. Each starts from the preceding
-pose and is regularized toward this pose.
+markers (NaN) have the weight 0. If the markers do not determine a degree of freedom at an instant,
+the result marks this instant. A second pass solves these instants in order. The search at each
+instant starts from the preceding pose and is regularized toward this pose.
 """
 
 from __future__ import annotations

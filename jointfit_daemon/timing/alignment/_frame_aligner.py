@@ -5,14 +5,15 @@ frame is emitted once, in order. Every sample has exactly one outcome.
 
 Frame k has the instant ``t_k = k period`` of host CLOCK_MONOTONIC, so the grid does not depend on
 the start time. The frame is emitted when every active stream has a sample at or after t_k, or at
-the deadline of the frame. The deadline is the time at which the next sample of every stream usually
-arrives, plus at most 1.5 periods of that stream. If a sample is missing, the orientation of its
-stream is extrapolated by up to 2.5 periods. After that the frame does not contain the stream.
+the deadline of the frame. Each stream has a deadline: the usual arrival of its next sample plus at
+most 1.5 of its periods. The deadline of the frame is the latest of them. If a sample is missing,
+the orientation of its stream is extrapolated by up to 2.5 periods. Later frames do not contain the
+stream.
 
 Invariant: frames never stop. While no stream has samples, frames without orientations are emitted.
 The first of these frames is emitted when every stream counts as lost, the others at the usual
-delay. Frames are skipped only if the whole process was stopped and did not request them within a
-second.
+delay. Frames are skipped only if the whole process was stopped for more than a second, so that the
+caller did not request them.
 
 In mode ``fast`` the last sample of a stream may precede t_k by up to one period of the stream, and
 the orientation is extrapolated to t_k. Frames are therefore emitted up to one period earlier, but
@@ -161,7 +162,10 @@ class FrameAligner:
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """Host time at which ``advance`` emits a frame even if no sample arrives, ns, or None."""
+        """Host time at which ``advance`` emits a frame even if no sample arrives, ns.
+
+        It is None while the instant of the first frame is unknown.
+        """
         if self._changed:
             self._deadline_ns = self._due()
             self._changed = False
@@ -180,9 +184,9 @@ class FrameAligner:
         now_ns : int
             Host instant, ns.
         complete_only : bool
-                Return no frame that lacks a sample, even after the deadline of the frame. The
-                option is for calls between two reads of the devices. After a stall of the process
-                the kernel usually has the missing sample in a buffer.
+            Return no frame that lacks a sample, even after the deadline of the frame. The option is
+            for calls between two reads of the devices. After a stall of the process the kernel
+            usually has the missing sample in a buffer.
         """
         frames: list[AlignedFrame] = []
         while (due_ns := self.next_deadline_ns) is not None and due_ns <= now_ns:
@@ -303,7 +307,7 @@ class FrameAligner:
         self._changed, self._served = True, None
 
     def close(self) -> None:
-        """Count the outcome of every pending sample and remove it; the next sample starts again."""
+        """Remove every pending sample and count its outcome; later samples restart the streams."""
         for _, stream in self._items:
             stream.reset()
         self._changed, self._served = True, None

@@ -123,7 +123,7 @@ def extrapolate_orientation(
 
 
 def _turn_to(sample: OrientationSample, before: OrientationSample) -> Vector:
-    """Return the rotation vector from the previous sample, and store it for the next call."""
+    """Return the rotation vector from `before` to `sample`, and store it in `sample`."""
     if sample.turn is None:
         sample.turn = difference_one(before.q, sample.q)
     return sample.turn
@@ -138,7 +138,10 @@ def _cross(u: Vector, v: Vector) -> Vector:
 
 
 def _agree(start: Vector, end: Vector, turn: Vector, h: float) -> bool:
-    """Return whether the rates at both ends agree with the rotation; wrong axes or units do not."""
+    """Return whether the rates at both ends agree with the rotation between them.
+
+    Rates with wrong axes or units do not agree.
+    """
     miss = size = 0.0
     for i in range(3):
         miss += (0.5 * h * (start[i] + end[i]) - turn[i]) ** 2

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 _FAR = 10
-"""A frame this many periods before the grid restarts the grid; smaller steps are reordered frames.
+"""Largest time, periods, by which a frame may precede the next grid time. An earlier frame restarts
+the grid.
 """
 
 

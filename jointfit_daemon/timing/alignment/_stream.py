@@ -42,12 +42,14 @@ DELAY_MOST_NS = 250_000_000
 """Largest delay that frames wait for, ns."""
 
 _EARLY = 20
-"""A sample expected less than 1/20 period before a frame may also be sampled just after it."""
+"""The deadline of a frame follows from the first sample that is expected no earlier than 1/20
+period before the frame. Jitter may place this sample after the frame.
+"""
 _DELAY_STEP = 128
 """The usual delay changes by 1/128 period per sample."""
 _DELAY_UP = 3
-"""Size of an increase relative to a decrease of the usual delay, which thus converges to the 75th
-percentile.
+"""Ratio of an increase to a decrease of the usual delay. With the ratio 3 the usual delay converges
+to the 75th percentile of the delays.
 """
 _BEHIND = 3
 """Number of samples at or before a frame that extrapolation needs."""
@@ -256,7 +258,11 @@ class Stream:
         return self._beyond(last, t_ns)
 
     def _before(self, at: int) -> _Sample | None:
-        """Return the sample before index `at` if it determines a rate with the next sample."""
+        """Return the sample before index `at`, or None.
+
+        The result is None if the interval to the sample at this index is too short or too long to
+        compute a rate.
+        """
         if not at:
             return None
         before = self._samples[at - 1]

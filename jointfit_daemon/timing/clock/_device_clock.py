@@ -1,16 +1,17 @@
 """Conversion of device time to host time, with one clock per device.
 
-Every sample gets a timestamp, in order of arrival. A sample takes a few microseconds, and memory is
-constant.
+Every sample gets a timestamp, in order of arrival. The computation takes a few microseconds per
+sample, and memory is constant.
 
 The model is ``t(u) = u + c + s (u - u_0)``, where u is the device time in ns, c the offset and s
 the skew. The first available source of this list is used:
 
 1. sync edges, or a device clock declared to be the host clock (``_direct_time``);
-2. echoes (``_echo_fit``), which leave half the path asymmetry in c;
-3. the minimum-delay filter on arrivals (``_minimum_delay``), which leaves the minimum delay D_min
-in c. The prior mean of D_min, `latency_ns`, is subtracted. The remaining delay is part of the lag
-that ``timing.lag`` estimates from motion.
+2. echoes (``_echo_fit``). The error of c is then half the difference between the delays of request
+and reply;
+3. the minimum-delay filter on arrivals (``_minimum_delay``). The error of c is then the minimum
+delay D_min. The prior mean of D_min, `latency_ns`, is subtracted. The remaining delay is part of
+the lag that ``timing.lag`` estimates from motion.
 
 Timestamps never decrease. Small errors are corrected gradually (slewed, ``_stamps``). A larger
 error starts a new epoch; samples of different epochs must not be combined.
@@ -50,8 +51,8 @@ CAUGHT_UP_NS = 50_000
 AWAY_SLACK_NS = 500_000_000
 """Tolerance of device time after the port was closed, ns, because bytes may have been buffered."""
 AWAY_TURNS = 20
-"""Least period of the device readings, in units of the tolerance. With a shorter period a restarted
-device would pass the check by chance in more than one of ten cases.
+"""Least period after which the device readings repeat, in units of the tolerance. With a shorter
+period a restarted device would pass the check by chance in more than one of ten cases.
 """
 
 _ARRIVAL, _COUNTER, _TICKS = range(3)
@@ -62,7 +63,8 @@ _ARRIVAL_SIGMA = 0.1
 _PRIOR_SIGMAS = 4.0
 """Largest difference between direct time and the estimate, in standard deviations."""
 _AWAY_SHARES = 0.0, 0.02, 0.001
-"""Relative tolerance of device time while the port was closed, for each source of device time."""
+"""Tolerance of device time after the port was closed, as a fraction of the elapsed time, for
+arrivals, counter and ticks."""
 _SKEW_CHECK_SAMPLES = 256
 """Number of samples between two plausibility checks of the skew."""
 
@@ -75,8 +77,8 @@ class DeviceClock:
     period_ns : int
         Nominal sample period, ns.
     latency_ns, latency_sd_ns : int
-            Prior mean and standard deviation of the minimum delay from sampling instant to arrival,
-        ns. The mean is subtracted where the clock is estimated from arrivals.
+        Prior mean and standard deviation of the minimum delay from sampling instant to arrival, ns.
+        The mean is subtracted if the clock is estimated from arrivals.
     """
 
     __slots__ = (
@@ -325,7 +327,10 @@ class DeviceClock:
     def _reader_for(
         self, ticks: int | None, counter: int | None, tick_clock: TickClock | None
     ) -> DeviceTime | None:
-        """Return the reader of the best available time; None if the sample lacks its usual time."""
+        """Return the reader of the best available device time.
+
+        Return None if this sample lacks the device time that the samples before contained.
+        """
         if ticks is not None and tick_clock is not None:
             self._absent = 0
             if tick_clock is self._tick_clock and self._kind == _TICKS and self._reader is not None:
@@ -370,7 +375,7 @@ class DeviceClock:
         return _clock_events.clock_reset_event(u - last_u, elapsed_ns)
 
     def _impossible(self, u: int, arrival_ns: int) -> ClockEvent | None:
-        """Return the event if a sample is too early or permanently late relative to the fit."""
+        """Return an event if samples are too early or permanently late relative to the fit."""
         last_u, doubts = self._line.last_u, self._doubts
         if last_u is None or u <= last_u:
             return None
@@ -385,7 +390,8 @@ class DeviceClock:
         if envelope.settled:
             return doubts.feed(excess, envelope.sigma_ns(u), arrival_ns)
         if excess < 0.0:
-            # Earlier samples came from stale bytes, up to seconds late, so the fit is discarded.
+            # The samples before were read from stale bytes, up to seconds after their arrival, so
+            # the fit is discarded.
             self._envelope = MinimumDelayFilter(NOMINAL_RATE if self._kind != _TICKS else CRYSTAL)
         return None
 
@@ -430,7 +436,7 @@ class DeviceClock:
         return u + offset - self.latency_ns, envelope.skew, settled, sigma, delay
 
     def _apply_direct_time(self, u: int, estimate: Estimate, direct: DirectTime) -> Estimate:
-        """Return the host time from `direct`, or `estimate` if it contradicts this time."""
+        """Return the host time from `direct`, or `estimate` if the two contradict each other."""
         self._state_direct = direct.usable(u)
         if not self._state_direct:
             return estimate
@@ -438,7 +444,7 @@ class DeviceClock:
         target = direct.host_ns(u)
         estimated, _, settled, sigma, delay = estimate
         if not settled and not possible(target, self._arrival_ns):
-            self._state_direct = False  # not confirmed before the estimate has settled
+            self._state_direct = False  # only a settled estimate can prove the direct time wrong
             return estimate
         slack = MARGIN_NS + _PRIOR_SIGMAS * (sigma + self.latency_sd_ns) + (self.bound_ns or 0.0)
         if settled and abs(target - estimated) > slack:
@@ -448,7 +454,7 @@ class DeviceClock:
         return target, direct.slope, True, direct.sigma_at(u), delay
 
     def _check_skew(self) -> None:
-        """Publish a warning, once, if the skew is implausible for any clock."""
+        """Add a warning to ``news``, once, if the skew is implausible for any clock."""
         self._looked = 0
         if self._warned or not self._synced:
             return

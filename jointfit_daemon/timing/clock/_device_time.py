@@ -28,9 +28,9 @@ COUNTER_WIDTHS = (1 << 8, 1 << 16, 1 << 32)
 """Moduli of sample counters."""
 
 _GAP = 1.5
-"""Intervals above this multiple of the usual interval are compared with the counter."""
+"""Least interval that is compared with the counter, in multiples of the usual interval."""
 _SLACK = 3
-"""Counts by which time and counter may disagree."""
+"""Largest accepted difference of time and counter, counts."""
 _SILENCE_LEAST_NS = 500_000_000
 """Least silence over which device time is compared with host time, ns. A busy host causes shorter
 delays.
@@ -40,7 +40,8 @@ _SILENCE_SHARE = 0.1
 _BACKLOG_NS = 100_000_000
 """Least delay of a backlog, ns, and tolerance of the first sample after the backlog."""
 _WRAP_SLACK = 8
-"""Counts by which a wrap may differ from the elapsed time while the counter width is unknown."""
+"""Largest accepted difference, counts, of a wrap from the elapsed time while the counter width is
+unknown."""
 _LATE = 0.65
 """Delay from which a sample counts as late, periods."""
 _DOUBTFUL = 0.35
@@ -58,8 +59,8 @@ _LATE_SHARE_LEAST = 0.03
 _LATE_SHARE_MOST = 0.65
 """Largest share of late samples, with which at most 32 late samples in a row count as a loss."""
 _LATE_LOG_CHANCE = -14.0
-"""Logarithm of the probability of a run of late samples by chance, one in a million, at which the
-samples count as lost.
+"""Natural logarithm of a probability, about one in a million. If a run of late samples is less
+probable by chance, samples count as lost.
 """
 _SILENCE_NS = 2 * NS_PER_S
 """Silence after which samples without device time cannot be numbered, ns."""
@@ -74,10 +75,11 @@ def _ran_on(step_ns: int, elapsed_ns: int) -> bool:
 def _has_backlog_ended(
     ahead_ns: int, u: int, arrival_ns: int, envelope: MinimumDelayFilter, echo: EchoFit | None
 ) -> bool:
-    """Return whether device time is ahead of the arrivals because the sample before was late.
+    """Return whether device time advanced more than the arrivals because a backlog has ended.
 
-    In that case the settled clock does not place the sampling instant after the arrival of the
-    sample. After a jump of the device clock without a backlog, the clock would place it there.
+    The sample before was then late, and this sample is not. According to the settled clock, this
+    sample was therefore taken before its arrival. After a jump of the device clock without a
+    backlog, the clock would return a sampling instant after the arrival.
     """
     if ahead_ns <= _BACKLOG_NS:
         return False
@@ -91,9 +93,9 @@ class TickTime:
     """Reader of device timestamps, with wraps and a consistency check against a sample counter.
 
     If device time and counter step forward together, samples are missing and the clock continues.
-    If only device time steps forward, the device restarted. An exception is a step that equals the
-    silence, or the delay of a backlog that ended: the device stopped sending, but its clock kept
-    running.
+    If only device time steps forward, the device restarted. There are two exceptions, in which the
+    clock of the device kept running: the step equals the time without samples, or it equals the
+    delay of a backlog that has ended.
     """
 
     __slots__ = ("_arrival_ns", "_backward", "_clock", "_counter", "_last", "_step", "_turn_ns")
@@ -112,7 +114,7 @@ class TickTime:
         return self._turn_ns
 
     def forget_counter(self) -> None:
-        """Skip the next counter check, because devices do not count during configuration."""
+        """Skip the next counter check, because devices do not count samples while configured."""
         self._counter = None
 
     def to_ns(self, ticks: int) -> int:
@@ -241,8 +243,8 @@ class ArrivalTime:
     A late sample is either part of a burst or follows lost samples. Only the next samples
     distinguish the two causes: after a burst they return to the minimum-delay line, after a loss
     they do not. Numbers are therefore consecutive until more successive samples are late than the
-    usual share of late samples explains. Their delay, in whole periods, is then the number of lost
-    samples. If the delay is not a multiple of the period, numbering restarts.
+    usual share of late samples explains. The number of lost samples is then the delay of the late
+    samples in whole periods. If the delay is not a multiple of the period, numbering restarts.
     """
 
     __slots__ = (

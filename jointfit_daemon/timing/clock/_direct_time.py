@@ -1,7 +1,8 @@
-"""Direct time from sync edges with two timestamps, or from a clock declared to be the host clock.
+"""Host time that is not estimated from arrivals (*direct time*).
 
-Direct time takes precedence over estimates from arrivals. If an estimate contradicts direct time, a
-warning is published.
+Direct time comes from sync edges with two timestamps, or from a device clock that is declared to be
+the host clock. It takes precedence over estimates from arrivals. If a settled estimate contradicts
+the direct time, the direct time is discarded and a warning is published.
 
 A sync edge is one instant with two timestamps: u on the device clock, v on the reference clock. The
 line ``v(u)`` through the edges of the last minute relates the two clocks with an accuracy of
@@ -29,7 +30,8 @@ SYNC_STALE_NS = 20_000_000_000
 KNOWN_SD_NS = 10_000.0
 """Standard deviation of a clock declared to be the host clock, ns."""
 MARGIN_NS = 3_000_000
-"""Tolerance, ns, beyond the prior of the minimum delay before a direct time is discarded."""
+"""Largest accepted difference of a direct time from the estimate, ns, in addition to the
+uncertainties of the estimate and of the minimum delay."""
 LATEST_NS = 2_000_000_000
 """Largest delay of a live sample, ns."""
 
@@ -150,7 +152,10 @@ class SyncEdgeFit:
         return self.reference.host_ns(self._reference_ns(u))
 
     def sigma_at(self, u: int) -> float:
-        """Return the standard deviation of ``host_ns(u)``, ns, with that of the reference."""
+        """Return the standard deviation of ``host_ns(u)``, ns.
+
+        It includes the standard deviation of the reference.
+        """
         own = sqrt(self._line.variance_at(u - self._ref[0]))
         return hypot(own, self.reference.sigma_at(self._reference_ns(u)))
 

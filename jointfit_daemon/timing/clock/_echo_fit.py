@@ -2,12 +2,13 @@
 
 An echo is sent at host time a, answered with server time u, and received at host time b. The clock
 offset is ``theta = u - (a + b)/2``, with an error of at most half the round-trip time ``rho = b -
-a``. The echoes with round-trip times near the minimum are fitted by ``theta(m) = theta_0 + s (m -
-m_0)``: weighted least squares with Huber weights and a prior on the skew s, which keeps s small in
-the first seconds. Half the path asymmetry remains in theta_0; ``bound_ns`` is its limit.
+a``. The line ``theta(m) = theta_0 + s (m - m_0)`` is fitted to the echoes with round-trip times
+near the minimum. The method is weighted least squares with Huber weights. A prior on the skew s
+keeps s small in the first seconds. The error of theta_0 is half the difference between the delays
+of request and reply; ``bound_ns`` is the limit of this error.
 
-Invariant: a single wrong or forged echo does not change the fit. An echo that contradicts the fit
-is not used. If the next echo agrees with the contradicting echo, the server clock was restarted.
+Invariant: a single wrong or forged echo does not change a settled fit. An echo that contradicts the
+fit is not used. If the next echo agrees with it, the server clock was restarted.
 """
 
 from __future__ import annotations

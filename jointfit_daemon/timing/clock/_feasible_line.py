@@ -8,8 +8,8 @@ lower convex hull that straddles the mean of u (Moon, Skelly, Towsley, INFOCOM 1
 Xia, INFOCOM 2002).
 
 The posterior mean under a normal prior on s has a smaller error than the maximum. It also has a
-covariance. Given s, c is at most ``h(s) = min(y - s u)`` and exponentially distributed below, with
-mean ``h(s) - 1/G``; the remaining integral over s is evaluated numerically.
+covariance. For a given s, the largest feasible c is ``h(s) = min(y - s u)``. Below this value c is
+distributed exponentially, with mean ``h(s) - 1/G``. The integral over s is evaluated numerically.
 
 Coordinates are integers, so the hull is exact.
 """
@@ -41,19 +41,20 @@ _LEAP = 20.0
 _LEAP_NS = 3_000_000.0
 """Least height of a point that is excluded by this ratio, ns."""
 _LEAP_LEAST = 4
-"""Least number of points below the gap; jitter alone produces such a gap once in 400 cases."""
+"""Least number of points below the gap between the two heights. With this number, jitter alone
+produces such a gap once in 400 cases."""
 _LIKELY = 1e-3
-"""Largest plausible slope of a device clock whose declared tick rate is correct, dimensionless."""
+"""Largest plausible slope of a clock whose declared tick rate is correct, dimensionless."""
 _TAIL = 14.0
 """Decrease of the log-likelihood at which the integral is cut off."""
 _PRIOR_TAIL = 6.0
-"""Standard deviations of the prior at which the integral is cut off."""
+"""Distance from the prior mean at which the integral is cut off, standard deviations."""
 _WILDEST = 5e-3
 """Largest slope of any clock, dimensionless."""
 _STEPS = 20
-"""Intervals of the slope grid."""
+"""Number of intervals of the slope grid."""
 _PASSES = 3
-"""Refinements of the slope grid."""
+"""Number of successive slope grids, each finer than the grid before."""
 
 
 def lower_hull(points: Iterable[Point]) -> list[Point]:
@@ -65,7 +66,7 @@ def lower_hull(points: Iterable[Point]) -> list[Point]:
             if (u1 - u0) * (y - y0) > (y1 - y0) * (u - u0):
                 break
             hull.pop()
-        if hull and hull[-1][0] == u:  # same u, and not lower because of the sorting
+        if hull and hull[-1][0] == u:  # sorting placed the lowest point with this u first
             continue
         hull.append((u, y))
     return hull
@@ -101,14 +102,14 @@ def mean_feasible_line(
 
     mean_u = sum(at for at, _ in points) / len(points)
     (ua, ya), (ub, yb) = straddling_edge(hull, mean_u)
-    # The slope is limited, because a burst read at one arrival A (y = A - u) forms an edge of slope
-    # -1.
+    # The slope is limited, because samples that were read at the same arrival A (y = A - u) form an
+    # edge with the slope -1.
     most = max(_PRIOR_TAIL * prior_sd, _WILDEST)
     edge = min(max((yb - ya) / (ub - ua), prior - most), prior + most)
 
-    # Scale of the heights above the edge, 1/G. The median height is log(2) times the mean height.
-    # The two points that define the edge contain no information, and the mean reduces the degrees
-    # of freedom by one.
+    # Scale of the posterior, 1/G, from the heights above the edge. The median height is log(2)
+    # times the mean height. The two points that define the edge contain no information, and the
+    # mean reduces the degrees of freedom by one.
     heights = sorted(y - ya - edge * (at - ua) for at, y in points)
     count = len(heights)
     median = heights[(count + _SUPPORTS) // 2] - heights[0]
@@ -139,8 +140,9 @@ def _on_time(
 ) -> Sequence[Point]:
     """Return the points that were not delayed by congestion.
 
-    Heights are measured above the hull. Where an edge of the hull ends at a delayed point, the hull
-    is continued at the nearest likely slope (`near` to `far`).
+    Heights are measured above the hull. Its outer edges are omitted if they end at a delayed point,
+    that is, if their slope is outside of the likely range from `near` to `far`. There the hull is
+    continued with the limit of this range.
     """
     u0, tilt = points[0][0], _slope(points[0], points[-1])
     rests = [y - tilt * (u - u0) for u, y in points]

@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 _HUBER = 1.345
-"""Huber threshold in standard deviations, with 95 % efficiency for normal errors."""
+"""Huber threshold in standard deviations. It has 95 % efficiency for normal errors."""
 _PASSES = 4
-"""Passes of iteratively reweighted least squares."""
+"""Number of iterations of the reweighted least squares."""
 
 
 class FittedLine(NamedTuple):

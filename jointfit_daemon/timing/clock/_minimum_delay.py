@@ -1,4 +1,4 @@
-"""Minimum-delay filter, which relates device clock and host clock by arrival times alone.
+"""Minimum-delay filter, which relates device clock and host clock from arrival times alone.
 
 With device time u and arrival A, the difference ``y = A - u = c + s u + D`` contains a delay ``D >=
 D_min`` of unknown distribution. The filter fits the line below all points (``mean_feasible_line``).
@@ -27,8 +27,8 @@ BUCKETS = 240
 with the thermal drift of a crystal.
 """
 YOUNG_NS = 10_000_000_000
-"""Span below which each bucket triggers a refit, ns. Above, the line is refitted every four
-seconds.
+"""Span of the points below which each bucket triggers a refit, ns. With a larger span the line is
+refitted every four seconds.
 """
 SETTLED_NS = 2_000_000_000
 """Least span of a settled line, ns."""
@@ -44,7 +44,7 @@ NOMINAL_RATE = 5000e-6
 """Prior standard deviation of a sample rate relative to its nominal value."""
 
 _OLD_REFIT_BUCKETS = 16
-"""Buckets between refits of a line older than ``YOUNG_NS``."""
+"""Number of buckets between two refits of a settled line with a span above ``YOUNG_NS``."""
 _FLOOR_VAR = FLOOR_NS**2
 _LINE_POINTS = 3
 """Least number of points for a line with a standard deviation."""

@@ -24,7 +24,7 @@ LATE_FOR_NS = 2_000_000_000
 LATE_SIGMAS = 20.0
 """Least delay that counts as late, in standard deviations of the clock estimate."""
 INTERVALS = 4
-"""Number of parts of `LATE_FOR_NS` whose fastest samples must agree."""
+"""Number of intervals of `LATE_FOR_NS`. The delays of their fastest samples must agree."""
 JITTER_NS = 25_000_000
 """Largest mean delay above the fastest samples, ns, that a paused clock explains."""
 EARLY_SAMPLES = 3
@@ -34,7 +34,7 @@ _INTERVAL_NS = LATE_FOR_NS // INTERVALS
 
 
 class _LateInterval(NamedTuple):
-    """Statistics of the late samples in half a second."""
+    """Statistics of the delays of late samples within half a second, ns."""
 
     least: float
     total: float
@@ -46,7 +46,7 @@ class _LateInterval(NamedTuple):
         return _LateInterval(least, total, self.samples + 1)
 
     def agrees(self, least: float) -> bool:
-        """Return whether all samples are late by at least `least` ns, and their jitter is small."""
+        """Return whether the least delay agrees with `least`, ns, and the jitter is small."""
         return self.least - least <= STEP_NS and self.total / self.samples - least <= JITTER_NS
 
 
@@ -60,7 +60,8 @@ class PlausibilityMonitor:
         """Whether the last sample was implausible."""
 
         self.early = 0
-        """Number of early samples in a row; the samples that follow determine the cause."""
+        """Number of early samples in a row. Only the samples that follow show whether a timestamp
+        was wrong or the clock jumped."""
         self._until_ns: int | None = None
         self._intervals: list[_LateInterval] = []
         self._interval = _LateInterval(0.0, 0.0, 1)

@@ -1,8 +1,8 @@
 """Host timestamps of one device, monotonic and slewed toward the clock estimate.
 
-Invariants: a timestamp in device order never decreases. Once synced, a timestamp approaches its
-estimate by at most 500 ppm of the elapsed time. A larger error is a step, which is returned to the
-caller.
+Invariants: timestamps never decrease in the order of device time. Once the clock is synced, a
+timestamp approaches its estimate by at most 500 ppm of the elapsed time. An error too large for
+this is a step, which is returned to the caller.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ class Stamp(NamedTuple):
 
 
 Estimate = tuple[int, float, bool, float, float]
-"""Tuple of host time, ns, skew, whether the clock has settled, standard deviation, ns, and delay,
-ns. The delay is measured from the fastest samples or, with echoes, from the sampling instant.
+"""Host time (ns), skew, whether the clock has settled, standard deviation (ns), and delay (ns).
+
+The delay is measured from the fastest samples or, with echoes, from the sampling instant.
 """
 
 
@@ -43,8 +44,8 @@ class MonotonicStamps:
     Parameters
     ----------
     period_ns : int
-            Nominal sample period, ns. While unsynced, consecutive timestamps are at least half a
-        period apart.
+        Nominal sample period, ns. Until the clock is synced, timestamps of consecutive samples are
+        at least half a period apart.
     """
 
     __slots__ = ("_newest", "_period_ns", "last_t", "last_u")
@@ -65,7 +66,7 @@ class MonotonicStamps:
         return self.last_t - self.last_u
 
     def stamp(self, u: int, target: int, skew: float, *, slew: bool) -> tuple[int, int]:
-        """Return the timestamp closest to `target`, and the step if one was needed.
+        """Return the permitted timestamp closest to `target`, and the step if one was needed.
 
         Parameters
         ----------
@@ -105,7 +106,7 @@ class MonotonicStamps:
         return t, step
 
     def forward(self, t: int) -> int:
-        """Return `t`, or the first instant after all timestamps that were returned."""
+        """Return `t`, or the first instant after all previous timestamps if `t` is not later."""
         if self._newest is not None and t <= self._newest:
             t = self._newest + 1
         self._newest = t

@@ -1,8 +1,9 @@
 """Matching of the sync edges of a device to the instants of the reference clock.
 
-All devices on a sync line assign timestamps to the same physical edges. Arrival-based clock
-estimates are accurate to a few milliseconds. Two timestamps therefore belong to the same edge if
-their estimated host times are close compared with the interval between edges.
+All devices on a sync line assign timestamps to the same physical edges. The clock estimates from
+arrivals convert these timestamps to host time with an error of a few milliseconds. Two timestamps
+therefore belong to the same edge if the difference of their host times is small compared with the
+interval between edges.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ class SyncLine:
         """Number of edges without a match, or with an ambiguous match."""
 
     def instant(self, edge: Edge) -> None:
-        """Add the next instant of the reference, which is a camera frame or an edge."""
+        """Add the next instant of the reference clock: a camera frame or an edge."""
         instants = self._instants
         if instants and edge.t_ns <= instants[-1].t_ns:
             if instants[-1].t_ns - edge.t_ns < FARTHEST_NS:

@@ -25,8 +25,8 @@ KERNEL_HALF_S = 0.08
 GAP = 1.5
 """Interval in nominal periods above which samples are missing."""
 BRIDGE_S = 0.035
-"""Longest gap that is filled with its mean rate, s. The integral is then exact, the filling is
-symmetric, and the gap is shorter than the cut-off period. Longer gaps split the track.
+"""Longest gap that is filled with the mean rate over the gap, s. The integral is then exact, the
+filling is symmetric, and the gap is shorter than the cut-off period. Longer gaps split the track.
 """
 
 _KAISER = 5.0
@@ -34,7 +34,7 @@ _KAISER = 5.0
 _MOST_ANGLE = np.pi / 2
 """Largest rotation between two poses, rad. A larger rotation is ambiguous."""
 _STENCIL = 5
-"""Samples of the fourth-order difference."""
+"""Number of samples that the fourth-order difference uses."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ def rates_from_orientations(
     Parameters
     ----------
     t_ns : ndarray, shape (n,)
-        Strictly increasing.
+        Instants of the poses, strictly increasing, ns.
     q : ndarray, shape (n, 4)
         q_world_body; rows with NaN are missing poses.
     origin_ns : int
@@ -118,7 +118,7 @@ def low_pass(rates: Rates, cutoff_hz: float) -> Rates:
     """Return the low-pass filtered rates (sinc times Kaiser, symmetric FIR of 0.16 s).
 
     The kernel is the same function of time at all sample rates, so two tracks are filtered
-    identically. Only samples with full kernel support remain, without transients.
+    identically. The result contains only samples with full kernel support, so it has no transients.
     """
     half = int(KERNEL_HALF_S / rates.period_s) if np.isfinite(rates.period_s) else 0
     at = np.arange(-half, half + 1) * rates.period_s if half else np.zeros(1)

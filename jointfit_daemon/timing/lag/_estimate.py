@@ -1,8 +1,9 @@
 r"""Lag of an IMU behind motion capture, estimated from angular rates.
 
 The estimate needs no world frame, heading, gravity or sensor-to-segment alignment, so it precedes
-all other fits. The lag has a standard deviation, and is rejected if the data do not determine the
-lag. The conditions are in ``_gate``; only a failed search is rejected here, in `coarse_lags`.
+all other fits. The result contains a standard deviation, and the reason of a rejection if the data
+do not determine the lag. The conditions are in ``_gate``; only a failed search is rejected here, in
+`coarse_lags`.
 
 Two rigidly connected bodies have the same angular rate up to a constant rotation and a gyro bias,
 
@@ -51,15 +52,15 @@ _CANDIDATE = 0.5
 _CANDIDATES = 4
 """Largest number of fitted maxima."""
 _TIE = 1e-3
-"""Correlation difference below which lags are not ranked. Periodic motion has equal maxima, whose
-order would depend on rounding errors. The three-axis fits then select the lag.
+"""Correlation difference below which lags are not ranked by their correlation. Periodic motion has
+equal maxima, whose order would depend on rounding errors. The three-axis fits then select the lag.
 """
 _SAME_S = 0.01
 """Distance below which two fitted lags are the same solution, s."""
 _RIVAL = 1.5
 """Ratio of residual variances below which two solutions cannot be distinguished."""
 _AGREE = 0.005
-"""Relative difference of the rates that two correct systems measure."""
+"""Expected relative difference between the rates that two correct systems measure."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,15 +70,15 @@ class LagEstimate:
     lag_ns: float
     """IMU timestamp minus reference timestamp of the same event, ns; NaN without a fit."""
     sigma_ns: float
-    """Standard deviation, ns, valid for correlated residuals and slowly varying timestamp errors.
-    """
+    """Standard deviation, ns. It includes the effects of correlated residuals and of slowly varying
+    timestamp errors."""
     r2: float
     """Coefficient of determination R², 1 - sum |residual|² / sum |omega|²."""
     refused: str | None
     """Reason for the rejection; None if the estimate is valid."""
     q_imu_ref: Quaternion = IDENTITY_ONE
-    """Rotation from reference-body to IMU coordinates; undetermined about a single axis of motion.
-    """
+    """Rotation from reference-body to IMU coordinates. If the motion has a single axis, the
+    rotation about this axis is undetermined."""
     bias: Vector = (0.0, 0.0, 0.0)
     """Bias of the IMU's rate, rad/s."""
     residual_rms: float = nan
@@ -215,7 +216,8 @@ def _best_and_rival(fits: list[LagFit], seen: LagEstimate) -> tuple[LagFit, LagF
     """Return the best fit, and another lag that fits nearly as well, or None.
 
     Without a rival the fit with the smallest residual is best. With rivals the residuals are not
-    decisive. The result is then the smallest lag, and the rival nearest to this lag.
+    decisive. The best fit is then the fit with the smallest lag, and the second result is the rival
+    with the nearest lag.
     """
     best = min(fits, key=lambda fit: fit.residual_rms)
     limit = _RIVAL * max(best.residual_rms, _AGREE * seen.rate_rms) ** 2
@@ -223,8 +225,8 @@ def _best_and_rival(fits: list[LagFit], seen: LagEstimate) -> tuple[LagFit, LagF
     if all(abs(fit.tau_s - best.tau_s) <= _SAME_S for fit in alike):
         return best, None
 
-    # Lags are compared in whole milliseconds, because lags of opposite sign differ in their last
-    # bits.
+    # Lags are compared in whole milliseconds, because the sizes of two lags of opposite sign may
+    # differ by rounding errors.
     nearest = min(alike, key=lambda fit: (round(1e3 * abs(fit.tau_s)), fit.tau_s < 0.0))
     others = [fit for fit in alike if abs(fit.tau_s - nearest.tau_s) > _SAME_S / 2]
     return nearest, min(
@@ -237,10 +239,10 @@ def coarse_lags(
 ) -> tuple[tuple[float, ...], str | None]:
     """Return candidate lags, s, best first, and the reason if there are none.
 
-    Candidates are maxima of the correlation of both rate magnitudes, which needs no rotation
-    between the systems. The best maximum must lie inside the search range. A maximum at the border
-    means that the lag is outside the range. Maxima that differ by less than ``_TIE`` are ranked by
-    the size of the lag, including maxima at the border.
+    Candidates are maxima of the correlation of both rate magnitudes. The magnitudes do not depend
+    on the rotation between the systems. The best maximum must lie inside the search range. A
+    maximum at the border means that the lag is outside the range. Maxima that differ from the best
+    by at most ``_TIE`` are ranked by the size of the lag, including maxima at the border.
     """
     step, reach = settings.step_s, round(settings.span_s / settings.step_s)
     scores = _correlations(imu, ref, step, reach)

@@ -17,12 +17,14 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.lag._angular_rates import Floats, Rates
 
 HUBERS = (1.5, 2.4, np.inf)
-"""Candidate Huber thresholds, for the norm of three components in standard deviations per axis
-(median 1.538). A low threshold suits bursts of optical errors. A high threshold suits errors that
-grow with the motion, where the largest residuals contain the most information.
+"""Candidate Huber thresholds for the norm of the three residual components, in standard deviations
+per axis (the median norm is 1.538). A low threshold suits bursts of optical errors. A high
+threshold suits errors that grow with the motion, where the largest residuals contain the most
+information.
 """
 CHOICES = 6
-"""Iterations in which the threshold with the least lag variance is selected; then it is fixed."""
+"""Number of first iterations that select the threshold with the least lag variance. The later
+iterations use the last selected threshold."""
 MEDIAN_NORM = 1.538
 """Median norm of a standard normal vector of three components."""
 STEP_S = 0.020
@@ -30,8 +32,8 @@ STEP_S = 0.020
 ITERATIONS = 30
 """Largest number of iterations."""
 DONE_S = 1e-6
-"""Change of the lag, s, that ends the search if reached twice in a row. The rotation is not
-checked, because it may change about a single axis of motion without any effect on the lag.
+"""Change of the lag, s. The fit has converged if two successive changes are smaller. The rotation
+is not checked, because it may change about a single axis of motion without effect on the lag.
 """
 LEAST_PAIRS = 16
 """Least number of compared rates."""
@@ -203,8 +205,8 @@ def _huber_weights(norm: Floats, clip: float) -> Floats:
 def _best_clip(linear: LinearizedLag) -> float:
     r"""Return the threshold, rad/s, with the least variance :math:`\sum h\psi^2 / (\sum h\psi')^2`.
 
-    h is the information of a row about the lag. Correlations between residuals are neglected,
-    because they are the same for all thresholds.
+    h is the information of a row about the lag, and psi the derivative of the Huber loss.
+    Correlations between residuals are neglected, because they are the same for all thresholds.
     """
     norm = _norms(linear.residual)
     scale = _scale(norm)

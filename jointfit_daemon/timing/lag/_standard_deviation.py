@@ -6,8 +6,8 @@ variance is therefore estimated in several ways, and the largest is used:
 
 * the delete-a-block jackknife (Tukey; Künsch 1989): the lag is computed without each block of the
 window in turn. The window has at most 20 blocks, none shorter than the filter. The computation is
-repeated with half as many blocks while at least five remain. The jackknife needs no model of the
-residuals. It detects a single block that determines the result;
+repeated with blocks of twice the length (a coarser scale) while at least five blocks remain. The
+jackknife needs no model of the residuals. It detects a single block that determines the result;
 * the estimator of Newey and West (1987), with residuals correlated over the shortest of these
 blocks.
 
@@ -18,8 +18,8 @@ equal probability. Coarser scales only detect long correlations; they are widene
 :math:`\nu/(\nu-2)`, the variance of t. If the window contains a single tap and otherwise rest, the
 result is infinite.
 
-Residuals do not show an error of the timestamps that is common to all samples with information
-about the lag. Devices sample on ticks of an internal clock. The rounding error of their timestamps
+If all samples with information about the lag have the same timestamp error, the residuals do not
+show this error. Devices sample on ticks of an internal clock. The rounding error of the timestamps
 is a sawtooth: the error drifts through one tick and jumps back. The mean error over time is part of
 the lag, but a short passage of fast motion contains only a part of the sawtooth. For a random phase
 the variance is
@@ -59,9 +59,9 @@ SIGMAS = 2.8
 STAMP_PERIODS_S = (1.95, 3.9)
 """Periods of the sawtooth error of the timestamps, s; the larger variance is used.
 
-The period is the tick divided by the relative skew, 0.5 ms by 257 ppm in recordings
-(``lag-all-trials``); the second period belongs to half the skew. A slower sawtooth is nearly
-constant in most windows, and is then part of their lag.
+The period is the tick divided by the relative skew. In the recordings of the experiment
+``lag-all-trials``, 0.5 ms divided by 257 ppm is 1.95 s. The second period belongs to half this
+skew. A slower sawtooth is nearly constant in most windows, and is then part of their lag.
 """
 _HARMONICS = np.arange(1, 4)
 """Numbers of the harmonics of the sawtooth that are used; they contain 83 % of its power."""
@@ -80,8 +80,9 @@ class LinearizedLag(NamedTuple):
     weight: Floats
     """Huber weights, shape (n,)."""
     give: Floats
-    """``-d log(weight) / d log |residual|``, shape (n,): 0 where the weight is 1, and 1 where the
-    Huber weight is below 1. Such a residual constrains the lag only across its own direction.
+    """``-d log(weight) / d log |residual|``, shape (n,): 0 where the Huber weight is 1, and 1 where
+    it is below 1. A residual with a weight below 1 constrains the lag only perpendicular to its own
+    direction.
     """
     rate: Floats
     """Rate of the slower track, rad/s, shape (n, 3)."""

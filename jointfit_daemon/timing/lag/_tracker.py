@@ -23,7 +23,7 @@ GATE_SIGMAS = 4.0
 `LagSettings` contains the thresholds for a single window.
 """
 STEP_WINDOWS = 3
-"""Consistent windows in a row beyond the threshold that count as a step."""
+"""Number of successive windows beyond this threshold, with consistent lags, that are a step."""
 AGREE_NS = 500_000.0
 """Largest range of consistent lags, ns."""
 
@@ -35,7 +35,7 @@ class TrackedLag:
     lag_ns: float
     sigma_ns: float
     drift: float
-    """d lag / dt, dimensionless; above 2e-6 a clock fit is faulty."""
+    """d lag / dt, dimensionless; a value above 2e-6 indicates a faulty clock fit."""
     drift_sigma: float
     step_ns: float | None = None
     """Size of the step, if this window confirmed one, ns."""
@@ -61,9 +61,10 @@ class LagTracker:
         self._refused: list[float] = []
 
     def feed(self, t_ns: int, estimate: LagEstimate) -> TrackedLag | None:
-        """Add the estimate of a window centred at `t_ns`; return the lag, None before the first.
+        """Add the estimate of a window centred at `t_ns`; return the tracked lag.
 
-        A rejected estimate only advances the time.
+        A rejected estimate only advances the time. The result is None before the first accepted
+        estimate.
         """
         if self._t_ns is not None:
             dt, self._t_ns = (t_ns - self._t_ns) * 1e-9, t_ns
