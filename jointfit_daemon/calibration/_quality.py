@@ -248,8 +248,8 @@ class RegressionQuality:
 
     sensors: tuple[str, ...]
     q_sign: Quaternion
-    """Reference quaternion. Before the regression, quaternions with a negative dot product with it
-    change their sign.
+    """Reference quaternion. Before the regression, the sign of a quaternion is changed if the dot
+    product of both is negative.
     """
     verified: tuple[tuple[float, ...], ...]
     """Coefficients that were fitted to the first part of the trial. ``holdout`` contains their

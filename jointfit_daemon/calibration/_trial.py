@@ -56,7 +56,7 @@ class OpticalTrack:
     """Orientations q_world_body of the rigid bodies, shape (m, len(bodies), 4)."""
     residuals: NDArray[np.float64] | None = None
     """Residuals of the cameras for the markers, m, shape (m, len(markers)); NaN where unknown. None
-    if no frame has one."""
+    if no frame has residuals."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,9 +1,9 @@
 """Robust fusion of several estimates of one center.
 
 Each estimate is weighted by its information matrix. If the estimate from one marker is uncertain in
-a direction, other markers therefore determine the center in this direction. An estimate that
-differs from the others by more than its covariance allows has a reduced weight, and a flag names
-it.
+a direction, other markers therefore determine the center in this direction. The weight of an
+estimate is reduced if it differs from the others by more than its covariance allows. A flag then
+names the estimate.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ def fuse_centers(estimates: Sequence[CenterEstimate], *, robust: bool = True) ->
     Parameters
     ----------
     estimates : sequence of CenterEstimate
-        Estimates of equal dimension in one parent frame, with independent errors. Noise of the
-        parent's markers is common to all estimates and is not modeled here; `RunningSphere` models
-        it.
+        Estimates of equal dimension in one parent frame, with independent errors. The error that
+        noise of the parent's markers causes is common to all estimates and is not modeled here;
+        `RunningSphere` models this error.
     robust : bool
         Whether to reduce the weight of estimates that contradict the others.
 

@@ -45,7 +45,8 @@ def hinge_axis_sd(points: Array, axis: Array | None) -> float | None:
     Returns
     -------
     float or None
-        Root mean variance of the two directions perpendicular to the axis; None without an axis.
+        Root of the mean variance in the two directions perpendicular to the axis; None without an
+        axis, or if the data do not determine its error.
     """
     seen = np.asarray(np.isfinite(points).all(axis=-1))
     if axis is None or np.count_nonzero(seen) < _FEWEST:

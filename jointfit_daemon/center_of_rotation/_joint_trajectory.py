@@ -68,7 +68,7 @@ def joint_trajectory(sides: Sequence[JointSide], frames: int) -> JointTrajectory
     .. math:: x(t) = \sum_k w_k(t)\, (R_k(t)\, c_k + t_k(t)), \qquad
               w_k \propto 1 / (s_k^2 + f_k^2)
 
-    The sum is over the segments k with a pose in frame t, :math:`c_k` is the center in segment k.
+    The sum is over the segments k with a pose in frame t. :math:`c_k` is the center in segment k.
     :math:`s_k^2` is the trace of the covariance of the center. :math:`f_k^2` is the trace of the
     covariance of the segment's pose error at the center. Both centers are estimated from the same
     movement, so their errors s are assumed to be fully correlated. The pose errors f are
@@ -134,7 +134,10 @@ def _in_world(side: JointSide, center: Array) -> Array:
 
 
 def _agreeing_track(side: JointSide, reference: Array) -> Array:
-    """Return the positions, moved to the mean of `reference` along unobserved directions."""
+    """Return the positions from one side, shifted to `reference` along unobserved directions.
+
+    After the shift, both tracks have the same mean along these directions.
+    """
     center, unseen = side.estimate.center, side.estimate.unseen
     other = side.poses.to_body(reference[:, None])[:, 0] @ side.basis
     shared = np.isfinite(other).all(axis=1)
@@ -159,7 +162,7 @@ def _pose_variance(side: JointSide) -> float:
     covariance = planar_noise if d == len("xy") else spatial_noise
     of_point = covariance(estimate.center, side.markers, noise)
 
-    # variance per direction that the marker noise does not explain is motion of the joint
+    # The part of the residual variance that marker noise does not explain is motion of the joint.
     excess = max(estimate.residual**2 - float(np.trace(of_point)) / d, 0.0)
     per_direction = of_point + (excess - noise**2) * np.eye(d)
     unseen = estimate.unseen.reshape(-1, d) if len(estimate.unseen) else np.zeros((0, d))

@@ -54,7 +54,8 @@ class EstimationMethod:
     planar: bool
     """Whether the method works in a plane; points in space are projected along `Movement.axis`."""
     run: Callable[..., CenterEstimate]
-    """Function of the movement and of the fields in `needs` that returns the estimate."""
+    """Function that returns the estimate. Its arguments are the movement and the fields in
+    `needs`."""
 
 
 def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterEstimate:

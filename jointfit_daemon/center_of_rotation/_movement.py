@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 PARENT_TURN_RAD = radians(0.8)
-"""Largest rotation of the child relative to the parent that the parent's marker noise may cause,
-rad.
+"""Largest apparent rotation of the child relative to the parent that noise of the parent's markers
+may cause, rad.
 
 If the markers are 10 cm from their mean, noise of 1 mm rotates the fitted parent frame by half of
 this value. Such rotations cannot be distinguished from joint rotations.
@@ -74,8 +74,8 @@ class Movement:
     axis: Array | None = None
     """Normal of the plane for planar methods on points in space, shape (3,); estimated if None."""
     near: Array | None = None
-    """Initial center, m, shape (d,); the mean of the markers if None. The estimate has this value
-    along unobserved directions.
+    """Initial center, m, shape (d,); the mean of the markers if None. Along unobserved directions
+    the estimate is equal to the initial center.
     """
     interval: float = 0.01
     """Time between frames, s."""

@@ -45,8 +45,8 @@ OFF_AXIS = (
     "or score, or give the axis"
 )
 LIMITS = CircleLimits(sd=inf)
-"""Acceptance limits without a limit on the error. The user chose the method, so the result is
-returned with its uncertainty.
+"""Acceptance limits without a limit on the error. The user selected the method, so every result is
+returned, with its uncertainty.
 """
 _GRID_STEP_M = 0.005
 
@@ -71,7 +71,7 @@ def fit_oriented(p: Array, movement: Movement) -> CenterEstimate:
 
 
 def grid(p: Array, _: Movement) -> CenterEstimate:
-    """Search the grid nodes around the circle fit of one marker, as a baseline method."""
+    """Return the best node of a grid around the circle fit of one marker, as a baseline method."""
     about = replace(circle_estimate(p, limits=LIMITS), method="grid")
     if about.refused is not None:
         return about
@@ -93,7 +93,7 @@ def three_frames(p: Array, movement: Movement) -> CenterEstimate:
         return replace(whole, method="three_frames")
     visible = np.asarray(np.isfinite(p).all(axis=1))
     seen = p[visible]
-    # the order is along the arc, not in time, because a movement may end where it began
+    # Frames are ordered along the arc, not in time, because a movement may end where it began.
     turn = np.unwrap(np.arctan2(*(seen - whole.center).T[::-1]))
     order = np.argsort(turn)
     middle = int(np.argmin(np.abs(turn - turn[order[[0, -1]]].mean())))

@@ -41,8 +41,9 @@ class CenterEstimate:
     arc: float
     """Angle covered by the markers about the center, rad."""
     bound: float
-    """Cramér-Rao bound of the RMS error, m; inf if a direction is unobserved. It assumes `noise`
-    that is independent from frame to frame. The bound depends on the movement, not on the method.
+    """Cramér-Rao bound of the RMS error, m; inf if a direction is unobserved. The noise is assumed
+    to have the size `noise` and to be independent from frame to frame. The bound depends on the
+    movement, not on the method.
     """
     conditioning: float
     """T, the curvature of the path divided by the standard error of the curvature. A circle with T
@@ -59,8 +60,9 @@ class CenterEstimate:
     """Standard deviation of the axis in each direction perpendicular to it, rad; None if unknown.
     """
     leverage: Array | None = None
-    """Covariance of the center per m² of radial soft-tissue artefact, shape (d, d); None if not
-    computed. The artefact repeats with posture, so more frames do not reduce it."""
+    """Covariance of the center per m² of variance of the radial soft-tissue artefact, shape (d, d);
+    None if not computed. The artefact repeats with posture, so more frames do not reduce this
+    covariance."""
     flags: tuple[str, ...] = ()
     """Findings about the data, e.g. ``orientation_inconsistent``."""
     within95: float | None = None

@@ -87,7 +87,7 @@ class CalibratedCenter:
     """Position of the center, m."""
     covariance: tuple[Vector, Vector, Vector]
     """Covariance of the center, m², which is 0 along `unseen`. Residuals from soft-tissue artefact
-    repeat with posture, so all frames together count as one observation of them.
+    repeat with posture, so all frames together count as one observation of the artefact.
     """
     unseen: tuple[Vector, ...]
     """Unit directions along which the movement did not determine the center."""

@@ -67,7 +67,7 @@ def branch_runs(chain: Chain) -> list[list[int]]:
 def body_parts(chain: Chain) -> list[str | None]:
     """Return the proximal body part, all segments, and the body parts distal to the chain's ends.
 
-    `joint_parts` relates them to the joints.
+    `joint_parts` relates the body parts to the joints.
     """
     return [chain.proximal, *chain.segments, *(chain.distals or (chain.distal,))]
 
@@ -84,7 +84,10 @@ def is_left(chain: Chain, joint: int) -> bool:
 
 
 def neighbor(chain: Chain, i: int) -> tuple[str, ...]:
-    """Return the sensors of the next segment (of the first branch), or of the previous segment."""
+    """Return the sensors of the segment distal to segment i, or of the proximal one if none exists.
+
+    If two segments are distal to segment i, the segment of the first branch is used.
+    """
     following = [joint for joint in distal_joints(chain, i) if joint < len(chain.segments)]
     if following:
         return chain.sensors[following[0]]

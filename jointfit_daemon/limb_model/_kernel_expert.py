@@ -43,8 +43,8 @@ class KernelExpert:
     hull_leverage: float
     """0.995 quantile of the leverage over the training frames."""
     carried: tuple[float, ...]
-    """Sum of the stacking shares of each axis, which is the part of the correction that generalizes
-    to held-out frames.
+    """Sum of the stacking weights of each axis, shape (3,). It is the fraction of the correction
+    that generalizes to held-out frames.
     """
 
     def correct(self, u: Array, sensors: int) -> tuple[Array, Array]:
@@ -56,7 +56,8 @@ class KernelExpert:
         Parameters
         ----------
         u : ndarray, shape (n, 3 m + 3)
-            Relative rotations of m sensors, then tilts.
+            Joint rotation and sensor disagreements (3 m columns), then tilts (3 columns), as
+            returned by `model_inputs`, rad.
         sensors : int
             Number of sensors m.
         """

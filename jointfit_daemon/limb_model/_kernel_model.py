@@ -7,11 +7,11 @@ r"""Recommended model: mean of the sensors with a posture-dependent soft-tissue 
 :math:`c_b` are two fits (`KernelExpert`) of :math:`\rho = \log(\bar q^* \otimes q_{ref})`. Expert a
 uses only relative rotations and generalizes to other movements. Expert b also uses the tilt of the
 segment and has smaller errors on the trained movements. Inside the training range both experts have
-equal weight. Outside, their weights :math:`\eta` decrease, and the linear trend T of
-`_kernel_trend`, which extrapolates best, replaces them. The weight of b decreases from the limit of
-the training range on, the weight of a from a larger distance on. The trend has no component about
-the long axis. About this axis the correction of a replaces the correction of b, and zero replaces
-the correction of a.
+equal weight. Outside, the factors :math:`\eta` decrease, and the linear trend T of `_kernel_trend`,
+which extrapolates best, replaces the experts. The factor of b decreases from the limit of the
+training range on, the factor of a from a larger distance on. The trend has no component about the
+long axis. About this axis the correction of a replaces the correction of b, and zero replaces the
+correction of a.
 
 Invariants: the correction is zero if the segment is upright, the joint is straight and the sensors
 agree. A rotation of the world about the vertical does not change the correction.
@@ -53,8 +53,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion
 
 HULL = 3.0
-"""Leverage ratio above which the weight of expert a is the square root of HULL divided by the
-ratio. If the ratio of expert b exceeds 1, the weight of b is the inverse of the ratio.
+"""Leverage ratio r of expert a above which its factor η is √(HULL / r). The factor of expert b is
+1 / r if the leverage ratio r of expert b exceeds 1.
 """
 OUTSIDE = 3.0
 """Leverage ratio of an expert above which a frame counts as extrapolation."""
@@ -125,15 +125,15 @@ class KernelModel(SegmentModel):
         u = relative_rotations_one(sensors, mean, q_other)
         a, ratio, b, b_ratio, (tx, ty) = self._tables.correct(u, tilts_one(mean))
 
-        # The weight of a decreases with the root of its leverage ratio, the weight of b with the
-        # ratio.
+        # The weight of a decreases with the square root of its leverage ratio, the weight of b with
+        # its leverage ratio.
         p = 1.0 - SHARE if ratio <= HULL else (1.0 - SHARE) * sqrt(HULL / ratio)
         s = SHARE / b_ratio if b_ratio > 1.0 else SHARE
         (ax, ay, az), (bx, by, bz) = a, b
         rest, along = 1.0 - p - s, p / (1.0 - SHARE)
 
-        # Without a trend about z, the correction of a replaces that of b, and zero replaces that of
-        # a.
+        # There is no trend about z. The correction of a replaces the correction of b, and zero
+        # replaces the correction of a.
         c = (
             p * ax + s * bx + rest * tx,
             p * ay + s * by + rest * ty,

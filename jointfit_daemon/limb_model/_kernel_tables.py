@@ -87,7 +87,7 @@ class KernelTables:
         seen = [*u, *tilts]
         smooth = smooth_terms_one(seen)
         row = [*smooth, *[v * v for v in seen], 1.0]
-        terms = self.terms.dot(np.array(row, np.float64))  # with a type NumPy is faster
+        terms = self.terms.dot(np.array(row, np.float64))  # NumPy is faster if the type is given
 
         bumps, roots = terms[: self.bumps], terms[self.bumps : self.roots]
         np.exp(bumps, bumps)

@@ -4,9 +4,9 @@ r"""Linear trend of the soft-tissue artefact, used outside the training range.
 
 for the axes j = x, y, which are horizontal in the static pose. The terms are a constant, the
 disagreement d of each further sensor about the same axis, and the tilt v about the same axis. The
-disagreement has the effect of other sensor weights. About z, the long axis of the segment, a
-constant and a heading are indistinguishable, so there is no trend. The trend does not depend on
-headings.
+term with d is equivalent to other weights of the sensors in the mean. About z, the long axis of the
+segment, a constant and a heading are indistinguishable, so there is no trend. The trend does not
+depend on headings.
 """
 
 from __future__ import annotations

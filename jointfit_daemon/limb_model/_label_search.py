@@ -2,10 +2,10 @@
 
 A hypothesis assigns a measured label to every marker of a cluster. Its cost is the negative
 logarithm of its likelihood. Marker errors are assumed to be Gaussian. An exchanged label is less
-probable than a correct label, and a marker that is at no marker position of a cluster is still less
-probable. If a cluster has nearly the same shape after an exchange, the exchange rotates the
-cluster. The joint centers of the cluster then differ from the joint centers of the adjacent
-clusters.
+probable than a correct label, and a label that is at no marker position of a cluster is even less
+probable. If a cluster has nearly the same shape after an exchange, the residuals hardly show the
+exchange. However, the exchange rotates the fitted cluster, and the joint centers of the cluster
+then differ from the joint centers of the adjacent clusters.
 
 The *static world* is the optical world as it was during the static pose.
 
@@ -90,8 +90,9 @@ class LabelFault(NamedTuple):
     """Labels of one frame that are not at the positions of their markers."""
 
     markers: tuple[str, ...]
-    """Names of the markers. Each label is at the position of the next marker, and the last at the
-    position of the first. A single label is at no marker position of a cluster."""
+    """Names of the markers. Each label is at the position of the next marker, and the last label at
+    the position of the first marker. If there is only one name, this label is at no marker position
+    of a cluster."""
     parts: tuple[str, ...]
     """Body parts of the markers, sorted."""
     cycle: bool = True
@@ -136,9 +137,10 @@ class _Frame(NamedTuple):
 
 
 class _Assignment(NamedTuple):
-    """Labels of one cluster in a hypothesis, as columns; -1 is hidden or displaced."""
+    """Assignment of labels to the markers of one cluster, which is part of a hypothesis."""
 
     columns: tuple[int, ...]
+    """Column of the label of each marker; -1 for a hidden or displaced marker."""
     cost: float
     centers: Array
     """Joint centers fixed in the cluster, m, shape (J, 3); NaN for other joints."""
@@ -223,7 +225,8 @@ class LabelSearch:
         """Search like `explain`, and yield between the parts of the search.
 
         The first part fits all clusters; if they fit, the search ends. Then each suspect cluster is
-        one part, and each group of combinations of their labels is one part.
+        one part. The combinations of the assignments of these clusters are divided into further
+        parts.
         """
         padded = np.concatenate((points, np.full((1, 3), np.nan)))
         seen = np.isfinite(padded).all(axis=1)
@@ -232,7 +235,7 @@ class LabelSearch:
         fits = _fit(self._template, padded[self._columns], seen[self._columns])
         rms, centers = fits.rms, fits.carry(self._centers)
 
-        # The visible markers of other clusters do not determine a pose.
+        # Clusters with too few visible markers, or with markers on a line, have no pose.
         fitted = np.array(
             [
                 seen[own].sum() >= MIN_MARKERS and not self._is_line(p, seen[own])
@@ -241,8 +244,8 @@ class LabelSearch:
         )
         rms[~fitted], centers[~fitted] = np.nan, np.nan
 
-        # Suspect are clusters that do not fit, and both clusters of a joint whose centers are
-        # apart.
+        # A cluster is suspect if its markers do not fit, or if the two centers of one of its joints
+        # are far apart.
         suspect = rms > self._limits
         for at in np.swapaxes(centers, 0, 1):
             (beside,) = np.nonzero(np.isfinite(at[:, 0]))
@@ -292,8 +295,8 @@ class LabelSearch:
             own = self._own[p].tolist()
             place_of |= {c: s for c, s in zip(columns, own, strict=True) if c not in (-1, s)}
             kept = {c for others in best for c in others}
-            # A fit without one marker always has a smaller residual. The limit prevents that
-            # soft-tissue artefact counts as a fault.
+            # A fit without one marker always has a smaller residual. Because of the limit,
+            # soft-tissue artefact does not count as a fault.
             if rms[p] > DISPLACED_M:
                 elsewhere += [s for s in own if seen[s] and s not in kept]
         for label in elsewhere:
@@ -364,7 +367,10 @@ class LabelSearch:
         suspects: Sequence[int],
         label: int,
     ) -> int | None:
-        """Return the hidden marker, of a cluster without faults, at whose position a label is."""
+        """Return the hidden marker at whose position a label is, or None if it is not unique.
+
+        Only clusters that are not suspect are searched.
+        """
         found = []
         for p, own in enumerate(self._own):
             if p in suspects or not np.isfinite(rms[p]):
@@ -419,7 +425,7 @@ def explain_trial(search: LabelSearch, positions: Array) -> tuple[LabelFault, ..
     names = [cluster.name for cluster in search.clusters]
     confirmed = []
     for fault, count in votes.items():
-        # Frames in which a cluster of the fault does not fit, or which the fault explains.
+        # Count the frames in which a cluster of the fault does not fit, or which it explains.
         parts = [names.index(part) for part in fault.parts]
         suspicious = sum(
             bool((finding.rms[parts] > MAX_FIT_RMS_M).any()) or fault in finding.faults

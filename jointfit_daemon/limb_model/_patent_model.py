@@ -48,8 +48,8 @@ class PatentModel(SegmentModel):
     intercept.
     """
     q_sign: Quaternion
-    """First reference of the training data. The sign of each input is changed if its product with
-    it is negative.
+    """First reference orientation of the training data. The sign of an input is changed if the
+    scalar product of the input and this quaternion is negative.
     """
     residual_sd: float
     movements: int

@@ -99,9 +99,9 @@ def steady_fit(template: Array, positions: Array) -> tuple[Array, Array, Array]:
     """Fit like `rigid_fit`, without steps in the pose when single markers disappear or reappear.
 
     Soft tissue moves every marker some millimeters, so the pose would step when a marker is hidden.
-    A frame with missing markers is therefore fitted to other marker positions on the body. They are
-    interpolated in time between the nearest complete frames, if these are at most `MAX_BRIDGE`
-    frames apart.
+    The fit of a frame with missing markers therefore uses another template: marker positions on the
+    body that are interpolated in time between the nearest complete frames. If these are more than
+    `MAX_BRIDGE` frames apart, the pose of `rigid_fit` is used.
     """
     q, t, rms = rigid_fit(template, positions)
     whole = visible(positions).all(axis=1)
@@ -136,6 +136,9 @@ def _usable(template: Array, seen: Mask) -> Mask:
 
 
 def is_line(points: Array) -> bool:
-    """Return whether points, (k, 3), m, are too close to a line to fit a rotation about it."""
+    """Return whether points are too close to a line to fit a rotation about this line.
+
+    The points have shape (k, 3), m.
+    """
     s = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
     return bool(s[1] < max(MIN_WIDTH_M, MIN_WIDTH_SHARE * s[0]))

@@ -78,8 +78,8 @@ class SensorLink:
         posture = posture_one(up_a, up_near)
         variance = self.spread * self.spread
 
-        # The quantity is not extrapolated. The change by an extrapolation is added to the
-        # uncertainty.
+        # The quantity is not extrapolated. The change that an extrapolation would cause is added to
+        # the uncertainty.
         kept = posture
         if not (all(map(le, self.low, posture)) and all(map(le, posture, self.high))):
             kept = tuple(map(min, map(max, posture, self.low), self.high))

@@ -8,13 +8,13 @@ A sensor at rest with its z axis up is rotated three times by 90 degrees:
 
 Let ``q_k`` be the orientation after rotation k. ``q_1 q_0*`` and ``q_3 q_2*`` must be +90 degrees
 about z in the world, and ``q_1* q_2`` must be +90 degrees about x in the sensor. Together the
-rotations determine the convention except for the heading. An inverse quaternion is also detected.
-It exchanges world and sensor; in sensor axes, the axes of rotations 1 and 3 are perpendicular
-instead of equal.
+rotations determine the convention except for the heading. If the device sends the inverse
+quaternion, world and sensor are exchanged. This is detected, because the axes of rotations 1 and 3
+are equal in the world, but perpendicular in the sensor.
 
-Exchanged components and wrong signs are an orthogonal transformation of q. Such a transformation is
-always equivalent to rotations of world and sensor that are applied to q or to its inverse. If
-several explanations exist, the simplest is returned.
+If a device exchanges components or signs of q, it applies an orthogonal transformation to q. Such a
+transformation is always equivalent to rotations of world and sensor that are applied to q or to the
+inverse of q. If several explanations exist, the simplest is returned.
 """
 
 from __future__ import annotations

@@ -102,9 +102,9 @@ def process_events(
 class _ChangedRun:
     """A core with replaced configurations, whose fits are computed in this process.
 
-    With another rig, the result of a fit is delivered at the instant of its request. With the
-    recorded rig, it is delivered at the recorded instant, so that all other inputs keep their
-    order.
+    With another rig, the result of a fit is delivered at the instant at which the fit was
+    requested. With the recorded rig, the result is delivered at the instant of the recorded result,
+    so that the order of all inputs is unchanged.
     """
 
     def __init__(self, core: Core, changes: Changes) -> None:

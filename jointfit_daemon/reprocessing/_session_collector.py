@@ -1,9 +1,9 @@
 """Collection of the measurements and outputs of a core as arrays of a session.
 
 All series share the time axis of the cameras. For this purpose, the lag of each sensor is
-subtracted from its stamps; the lags are those of the calibration in use at the end. Rows whose
-instant is not later than the previous row are omitted, because a clock that settles or restarts may
-step back.
+subtracted from its stamps. The lags come from the calibration in use at the end of the session.
+Rows that are not later than the previous row are omitted, because a clock that settles or restarts
+may step back.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class _Rows:
         self._width, self._t_ns, self._values = width, array("q"), array("d")
 
     def add(self, t_ns: int, *parts: Sequence[float]) -> None:
-        """Append `parts` as one row, unless its instant is not later than that of the last row."""
+        """Append `parts` as one row if `t_ns` is later than the instant of the last row."""
         if not self._t_ns or t_ns > self._t_ns[-1]:
             self._t_ns.append(t_ns)
             for part in parts:

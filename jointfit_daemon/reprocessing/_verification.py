@@ -38,13 +38,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Event, Output
 
 WARM_UP_S = 20.0
-"""Time after which the clocks and filters of the replay agree with those of the daemon, s, if the
-replay started later."""
+"""Warm-up of a replay whose recording began after the start of the daemon, s. After this time the
+clocks and filters of the replay agree with the clocks and filters of the daemon."""
 TOLERANCE_RAD = np.radians(1.0)
 """Largest difference of an orientation after the warm-up, rad."""
 TOLERATED_SHARE = 0.99
-"""Share of the orientations that must be within the tolerance. Orientations near a lost frame may
-differ by more."""
+"""Smallest fraction of the orientations that must be within the tolerance. Orientations near a lost
+frame may differ by more."""
 _OUTPUT = "output/"
 
 
@@ -286,7 +286,7 @@ class _Orientations:
         self._rows: dict[str, tuple[list[int], list[Quaternion]]] = {}
 
     def add(self, name: str, t_ns: int, q: Quaternion | None) -> None:
-        """Append one orientation, unless it is unknown or not later than the last one."""
+        """Append one orientation if it is known and later than the last one."""
         stamps, rows = self._rows.setdefault(name, ([], []))
         if q is not None and (not stamps or t_ns > stamps[-1]):
             stamps.append(t_ns)

@@ -165,7 +165,7 @@ def _candidates(times: Array, rates: Array) -> Iterator[tuple[float, float]]:
 
 
 def _objection(times: Array, rates: Array, cycle: tuple[float, float]) -> str | None:
-    """Return the reason why an interval is not a cycle of walking, or None if it is."""
+    """Return the reason why an interval is not a gait cycle; None if it is a gait cycle."""
     start, end = cycle
     if not SHORTEST_S <= end - start <= LONGEST_S:
         return (
@@ -202,7 +202,7 @@ def _regular_runs(candidates: list[tuple[float, float]]) -> list[tuple[float, fl
 
 
 def normalize_cycles(t_s: Array, values: Array, cycles_s: Array, points: int = 101) -> CycleCurves:
-    """Interpolate a series at 0 to 100 % of each cycle, without cycles with unknown values.
+    """Interpolate a series at 0 to 100 % of each cycle; cycles with unknown values are omitted.
 
     Parameters
     ----------

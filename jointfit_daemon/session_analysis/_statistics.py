@@ -143,7 +143,7 @@ class SeriesQuality:
     rate_hz: float
     """Rate, Hz, the inverse of the median interval; NaN for less than two rows."""
     lost_share: float
-    """Fraction of the expected samples between the first and the last row that is missing."""
+    """Missing samples as a fraction of the samples expected between the first and the last row."""
     gaps_s: Array
     """Start and end of each interval without samples, s, shape (n, 2)."""
 

@@ -35,13 +35,13 @@ class SessionData:
     sensors: tuple[SensorSeries, ...] = ()
     markers: MarkerSeries | None = None
     segments: tuple[SegmentSeries, ...] = ()
-    """Orientations of segments from the sensors."""
+    """Orientations of segments, computed from the sensors."""
     joints: tuple[JointSeries, ...] = ()
-    """Joints from the sensors."""
+    """Angles and positions of joints, computed from the sensors."""
     optical_segments: tuple[SegmentSeries, ...] = ()
-    """Orientations of segments from the markers, which are the reference."""
+    """Reference orientations of segments, computed from the markers."""
     optical_joints: tuple[JointSeries, ...] = ()
-    """Joints from the markers, which are the reference."""
+    """Reference angles and positions of joints, computed from the markers."""
     events: tuple[TimelineEvent, ...] = ()
     """Events in the order of their instants."""
     description: Mapping[str, str] = field(default_factory=dict)

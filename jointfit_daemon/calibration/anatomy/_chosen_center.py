@@ -122,7 +122,7 @@ def chosen_center(
 
 
 def _angle_leverage(angles: Array, unseen: Array) -> Array:
-    r"""Return the covariance of a center per m² of artefact if the angles are known, (3, 3).
+    r"""Return the covariance of a center per m² of artefact variance for known angles, (3, 3).
 
     In the plane, positions are linear in center and marker, :math:`x_t = c + R(\theta_t) p`. The
     covariance for one observation of unit variance is

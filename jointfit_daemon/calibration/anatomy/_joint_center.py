@@ -136,7 +136,7 @@ def artefact_leverage(points: Array, center: Array, unseen: Array) -> Array:
 
 
 def align_vertically(found: CenterEstimate, above: Array | None) -> CenterEstimate:
-    """Move a center along its unobserved directions above or below a point.
+    """Move a center along its unobserved directions until it is above or below a point.
 
     A hinge does not determine the position of its center along the axis. The center is not moved
     along nearly vertical directions, because the horizontal position of a neighbor does not

@@ -171,7 +171,7 @@ def _static_body(track: OpticalTrack, name: str, body: str) -> MarkerCluster:
 
 
 def track_cluster(track: OpticalTrack, cluster: MarkerCluster) -> ClusterTrack:
-    """Return the poses of one body part in a trial; NaN has the meaning of `rigid_fit`.
+    """Return the poses of one body part in a trial; NaN marks frames without a pose.
 
     Raises
     ------

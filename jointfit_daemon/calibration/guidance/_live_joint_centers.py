@@ -160,7 +160,10 @@ class LiveJointCenters:
                 sphere.feed(v[k, : self._sizes[k]])
 
     def estimate_next(self) -> tuple[LiveJointCenter, CenterEstimate | None]:
-        """Estimate the next joint in turn. The fit is None below two observed directions."""
+        """Estimate the center of the next joint in turn.
+
+        The second result is the fit, or None if fewer than two directions were observed.
+        """
         k = self._turn = (self._turn + 1) % len(self.joints)
         with np.errstate(all="ignore"):  # markers at rest cause divisions by zero
             estimate = self._spheres[k].estimate()
@@ -170,8 +173,8 @@ class LiveJointCenters:
     def estimate_centers(self) -> dict[str, LiveJointCenter]:
         """Return the current estimates; call a few times per second, not in every frame.
 
-        An estimate takes a thousand times as long as a frame, so each call updates only one joint
-        in turn.
+        An estimate takes a thousand times as long as `feed`, so each call updates only one joint in
+        turn.
         """
         if self.joints:
             self.estimate_next()
@@ -199,7 +202,7 @@ class LiveJointCenters:
     def _observed_estimate(
         self, k: int, fit: CenterEstimate
     ) -> tuple[LiveJointCenter, CenterEstimate | None]:
-        """Return an estimate without directions in which the markers hardly rotated."""
+        """Return an estimate in which directions with hardly any rotation count as unobserved."""
         joint, frames = self.joints[k], int(self._frames[k])
         center = np.asarray(fit.center, dtype=np.float64)
         shown, axes, clear = np.zeros((3, 3)), np.eye(3), np.zeros(3, dtype=np.bool_)

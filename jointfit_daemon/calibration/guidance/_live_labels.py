@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import MocapFrame, MocapLayout
 
 _INTERVAL = 24
-"""One of this number of frames is examined. The search takes milliseconds and is divided among the
-frames that follow.
+"""Interval between two examined frames, frames. The search takes milliseconds and is divided among
+the frames that follow.
 """
 _RECENT = 12
 """Number of examined frames on which a decision is based: 2 to 3 s at 100 to 120 Hz."""

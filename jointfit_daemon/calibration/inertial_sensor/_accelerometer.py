@@ -253,7 +253,10 @@ class AccelerometerStep:
         return [face for face in range(FACES) if face not in taken]
 
     def _tilts(self) -> dict[str, int]:
-        """Return the number of missing poses by pair of axes, which show the non-orthogonality."""
+        """Return the number of missing tilted poses by pair of axes.
+
+        The tilted poses determine the non-orthogonality.
+        """
         units = np.abs(np.array([force / np.linalg.norm(force) for force in self._forces]))
         found = dict.fromkeys(_PLANES, 0)
         for unit in units:

@@ -32,10 +32,10 @@ _BIAS, _SCALE, _SKEW = slice(0, 3), slice(3, 6), slice(6, 9)
 
 @dataclass(frozen=True, slots=True)
 class EllipsoidFit:
-    """Parameters of an ellipsoid, in units of `unit` about `origin`."""
+    """Parameters of an ellipsoid, in the unit of the fitted vectors."""
 
     bias: Array
-    """Center in units of `unit` from `origin`, shape (3,)."""
+    """Center of the ellipsoid, shape (3,)."""
     matrix: Array
     """Symmetric matrix that maps the ellipsoid to the unit sphere, shape (3, 3)."""
     covariance: Array
@@ -49,7 +49,7 @@ class EllipsoidFit:
 
 
 def fit_unit_ellipsoid(vectors: Array, parameters: int) -> EllipsoidFit:
-    """Fit an ellipsoid to vectors about 0 with lengths of approximately 1.
+    """Fit an ellipsoid to vectors whose mean is near 0 and whose lengths are approximately 1.
 
     Parameters
     ----------

@@ -6,10 +6,11 @@ the true rate is G (m - b). The rotation R of the turn maps one direction to the
 
 .. math:: R u_1 = u_0, \qquad R = \prod_i \exp(G (m_i - b_i) \Delta t_i)
 
-The estimate of G minimizes the squared differences of all turns. b is the mean rate of the rests,
-interpolated over the turn. A turn determines two of three components, because a rotation about the
-vertical does not change u. Turns about a level axis determine the scale factor of this axis. The
-error after a full turn is a quarter of the error after a quarter turn.
+The estimate of G minimizes the sum over all turns of the squared differences between R u_1 and u_0.
+b is the mean rate of the rests, interpolated over the turn. A turn determines two of three
+components, because a rotation about the vertical does not change u. Turns about a level axis
+determine the scale factor of this axis. The error of a scale factor from a full turn is a quarter
+of the error from a quarter turn.
 
 Source: Tedaldi, Pretto and Menegatti 2014, ICRA, 3042-3049, section IV.
 """
@@ -67,7 +68,7 @@ class GyroscopeScaleEstimate:
     covariance: Array
     """Covariance of the diagonal of `matrix`, or of all elements by rows."""
     degrees_of_freedom: int
-    """Twice the number of turns, minus the number of parameters."""
+    """Twice the number of turns minus the number of parameters."""
     turns: int
     angle: float
     """Sum of the angles of the turns, rad."""
@@ -156,7 +157,7 @@ class _Fit:
         self.degrees_of_freedom = 2 * len(turns) - len(columns)
         variance = float(self.differences @ self.differences) / self.degrees_of_freedom
         variance = max(variance, _LEAST_SD**2)
-        # an element that no turn determines gets a large variance instead of an infinite variance
+        # The added term limits the variance of an element that no turn determines.
         normal = slopes.T @ slopes + _TINY * np.eye(len(columns))
         self.covariance = np.asarray(variance * np.linalg.inv(normal))
         self.deviations = np.sqrt(np.diag(self.covariance))

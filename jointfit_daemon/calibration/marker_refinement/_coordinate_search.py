@@ -5,9 +5,10 @@ therefore be used with any model, including a model in another program. Every un
 has a separate step length::
 
     while any step is at or above the threshold:
-        for every marker, for x, y, z whose step is:
-            go on in + while the error falls; if it never did, go on in - while it falls if neither
-            way helped: halve the step
+        for every coordinate x, y, z of every marker whose step is at or above the threshold:
+            move the coordinate by +step while the error decreases
+            if it was not moved: move the coordinate by -step while the error decreases
+            if it was not moved: halve the step
 
 Source: Price, LaPrè, Johnson, Umberger and Sup, Int J Numer Method Biomed Eng 36 (2020) e3283, doi
 10.1002/cnm.3283. The paper does not state the first step, the threshold, the order of the

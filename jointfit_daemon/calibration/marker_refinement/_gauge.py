@@ -38,8 +38,8 @@ class Gauge:
     """Directions of marker displacement that the data of the trials do not determine."""
 
     eigenvalues: Array
-    """Eigenvalues of S/T over the unlocked coordinates in ascending order. A fully observed marker
-    has 1.
+    """Eigenvalues of S/T over the unlocked coordinates in ascending order. The eigenvalues of a
+    fully observed marker are 1.
     """
     free: int
     """Number of zero eigenvalues, which are displacements without effect on the tracking error."""

@@ -50,13 +50,13 @@ class RefinementSettings:
     the cost of an error of 1 m.
     """
     huber_m: float | None = 0.02
-    """Error above which the loss is linear instead of quadratic, m. None makes it quadratic for all
-    errors.
+    """Error above which the loss is linear instead of quadratic, m. With None the loss is quadratic
+    for all errors.
     """
     cost: RefinementCost = "l2"
     """Loss function. ``l2`` is the squared error up to `huber_m`. ``l1`` is the distance, so that a
-    marker with frequent large errors has little influence; the method ``search`` does not support
-    it.
+    marker with frequent large errors has little influence. The method ``search`` does not support
+    ``l1``.
     """
     frames: int = 150
     """Largest number of frames of a trial. Longer trials are decimated, so that no trial dominates.
@@ -70,8 +70,8 @@ class RefinementSettings:
     on a model without limits.
     """
     holdout_share: float = 0.0
-    """Fraction of every training trial, at its end, that is not fitted. Its error determines when
-    the iteration stops.
+    """Fraction of every training trial, at its end, that is not fitted. The error of these frames
+    determines when the iteration stops.
     """
     tolerance: float | None = None
     """Relative decrease of F below which the iteration ends; None selects the default of the

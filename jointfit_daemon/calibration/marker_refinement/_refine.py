@@ -53,8 +53,8 @@ if TYPE_CHECKING:
     """
 
 L1_CORNER_M = 0.001
-"""Distance below which the loss of the cost ``l1`` is quadratic, m. Otherwise its derivative would
-be discontinuous at zero.
+"""Distance below which the loss of the cost ``l1`` is quadratic, m. Otherwise the derivative of the
+loss would be discontinuous at zero.
 """
 _FINE = 1e-9
 STOPPED = "stopped before convergence"
@@ -178,8 +178,8 @@ def _task(
     first = solve_frames(model, targets, weights, options=options)
     first, improved = restart_local_minima(model, targets, weights, first, options)
     if settings.cost == "l1":
-        # The l1 loss of a typical error is smaller than its square. The prior is scaled by the same
-        # factor.
+        # The l1 loss of a typical error is smaller than its l2 loss. The prior is scaled by the
+        # same factor.
         typical = float(np.nanmedian(np.linalg.norm(first.residuals, axis=-1)))
         weaker = min(1.0, L1_CORNER_M / max(typical, L1_CORNER_M))
         problem = replace(problem, huber_m=L1_CORNER_M, prior=weaker * settings.prior)

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e-12, 1e9
 _FLOOR = 1e-11
-"""Constant that is added to the diagonal of A_t. It keeps degrees of freedom without markers
-constant.
+"""Constant that is added to the diagonal of A_t, so that degrees of freedom without markers do not
+change.
 """
 _TOLERANCE = 1e-6
 """Relative decrease of F below which the iteration ends."""
@@ -146,7 +146,7 @@ def solve_simultaneously(
 
     Returns
     -------
-    list of Step
+    list of RefinementStep
         The start and every accepted iterate.
     """
     steps, damping = [start], _FIRST_DAMPING

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.limb_model import Calibration
 
 SLACK = 1.15
-"""Largest ratio of the hold-out errors of two trials that count as equally good."""
+"""Largest ratio of the hold-out errors of two calibrations that count as equally good."""
 SLACK_RAD = np.deg2rad(0.3)
 """Absolute difference of hold-out errors that is accepted, rad."""
 SLACK_M = 0.005
@@ -29,11 +29,11 @@ class CalibrationComparison(NamedTuple):
 def compare_calibrations(new: Calibration, old: Calibration | None) -> CalibrationComparison:
     """Compare a new calibration with the current calibration.
 
-    The first criterion in which the calibrations differ determines the result. The order is: chain,
-    use of cameras, alignment of the worlds, and finally the errors together. The errors are the
-    hold-out errors of each segment and of the flexion of each inner joint (tolerance: factor 1.15
-    plus 0.3°), and the gap between the centers fixed in the two body parts of a joint (tolerance: 5
-    mm).
+    The first criterion in which the calibrations differ determines the result. The criteria are, in
+    this order, the chain, the use of cameras, the alignment of the worlds, and all errors together.
+    The errors are the hold-out errors of each segment and of the flexion of each inner joint, and
+    the gap between the centers fixed in the two body parts of a joint. A hold-out error may be
+    larger by the factor 1.15 plus 0.3°, and a gap by 5 mm.
     """
     if old is None:
         return CalibrationComparison(True, "no calibration was in force")

@@ -135,7 +135,8 @@ def fit_calibration(
     """
     pose = static if isinstance(static, StaticPose) else fit_static(static, settings, chain)
 
-    # The optical reference consists of body parts. Lags of sensors are relative to it.
+    # The optical reference consists of body parts. The lags of the sensors are relative to this
+    # reference.
     refined, tracks = refined_tracks(_tracks(pose, functional, chain), pose, functional, settings)
     moving = _lags(chain, functional, tracks, lag_ns or {})
     lags = _lags_in_use(chain, moving, alignment, _earlier_lags(previous, tracked), lag_ns or {})
@@ -303,7 +304,10 @@ def _lags_in_use(
     earlier: Mapping[str, SensorLag],
     known: Mapping[str, int],
 ) -> dict[str, SensorLag]:
-    """Return the configured lags, or else lags from movement and plate, or else earlier lags."""
+    """Return the lag of each sensor, from the first source that has one.
+
+    The sources are the configuration, then movement and plate together, then earlier lags.
+    """
     plate = {} if alignment is None else alignment.quality
     prior = {
         name: (

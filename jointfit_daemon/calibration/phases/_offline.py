@@ -1,8 +1,9 @@
-"""Fit and evaluation of recorded trials that contain a reference, without clocks and markers.
+"""Fit and evaluation of recorded trials that contain a reference orientation of each segment.
 
-Sensors and reference have the same world and the same time axis. The evaluation always uses
-held-out data, either a whole trial or the last part of a single trial. The resulting calibration
-has the same form as a calibration by the daemon; lengths and joint centers are unknown.
+Sensors and reference have the same world and the same time axis, so clocks and markers are not
+needed. The evaluation always uses held-out data, either a whole trial or the last part of a single
+trial. The resulting calibration has the same form as a calibration by the daemon; lengths and joint
+centers are unknown.
 """
 
 from __future__ import annotations
@@ -187,7 +188,9 @@ def evaluate(
     methods: Sequence[Method] = COMPARED,
     holdout: float = 0.4,
 ) -> MethodEvaluation:
-    """Evaluate every method on each trial, which is held out, or on the end of a single trial.
+    """Evaluate every method on each trial in turn, after a fit to the other trials.
+
+    A single trial is divided: the methods are fitted to its first part and evaluated on the rest.
 
     Parameters
     ----------

@@ -52,17 +52,18 @@ if TYPE_CHECKING:
 FEWEST = 200
 """Smallest number of new frames."""
 HELD = 0.3
-"""Fraction of the new frames, the newest, that is held out."""
+"""Fraction of the new frames that is held out. These are the newest frames."""
 GAIN = 0.97
 """Largest ratio of the candidate's error to the error of the current models, on held-out frames.
 """
 GAIN_RAD = np.deg2rad(0.05)
 """Smallest decrease of the error with which the candidate is accepted, rad."""
 WORSE = 1.15
-"""Largest factor of the increase of a single error on earlier frames, as in `compare_calibrations`.
+"""Largest accepted ratio of an error on earlier frames to the same error before the refit. The
+constant `WORSE_RAD` is added, as in `compare_calibrations`.
 """
 WORSE_RAD = np.deg2rad(0.3)
-"""Constant part of the largest accepted increase of an error, rad."""
+"""Increase of an error on earlier frames that is accepted in addition to `WORSE`, rad."""
 MOST_CHANGE = np.deg2rad(8.0)
 """Largest 0.95 quantile of the change of the predictions in known postures, rad. Soft tissue does
 not change faster.
@@ -70,12 +71,14 @@ not change faster.
 MARKERS_RMS_M = 0.015
 """RMS residual of the markers of a frame above which the frame is ignored, m."""
 MOST_LEFT_OUT = 0.3
-"""Largest share of ignored frames."""
+"""Largest fraction of ignored frames."""
 CONTRADICTED = np.deg2rad(8.0)
-"""Median angle between cameras and current models above which one of the two is wrong, rad."""
+"""Median angle between the orientations from the cameras and from the current models, rad. Above
+this angle one of the two is wrong.
+"""
 SHIFTED = np.deg2rad(5.0)
-"""Largest mean rotation between cameras and current models, rad. A displaced marker cluster causes
-a larger rotation.
+"""Largest length of the median rotation from the current models to the cameras, rad. A displaced
+marker cluster causes a larger rotation.
 """
 TURN_FRAMES = 150
 """Number of frames over which heading drift is assumed to be constant: 15 s."""

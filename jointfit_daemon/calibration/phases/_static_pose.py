@@ -132,9 +132,8 @@ def fit_static_only(
     """Calibrate without cameras, with all segments upright and the plain mean of the sensors.
 
     Without an alignment, every sensor world is assumed to equal the world of the static pose, as in
-    the patent.
-    If the headings of the sensors are arbitrary, only the inclination is then correct. The flag is
-    ``headings_from_static``.
+    the patent. If the headings of the sensors are arbitrary, only the inclination is then correct.
+    The calibration has the flag ``headings_from_static``.
     """
     upright: Quaternion = (1.0, 0.0, 0.0, 0.0)
     flag = FrameFlag.FACING_UNKNOWN

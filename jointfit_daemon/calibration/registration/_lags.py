@@ -52,7 +52,7 @@ MARKER_TISSUE_SD_NS = 3e6
 """Standard deviation of the lag that soft tissue under the markers of a segment causes, ns."""
 MAX_PRIOR_DEVIATION = 4.0
 """Difference between the lags on the plate and in the movement, in standard deviations, above which
-a clock or filter must have changed. The later lag is then used.
+a clock or filter must have changed. The lag from the movement is then used alone.
 """
 
 

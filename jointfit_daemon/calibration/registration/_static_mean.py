@@ -92,9 +92,10 @@ def component_mean(q: ArrayLike) -> RobustMean:
 
     .. math:: \bar q = \sum s_i q_i \,/\, \lVert \sum s_i q_i \rVert, \qquad s_i = \pm 1
 
-    The signs :math:`s_i` make the product of every quaternion with the first non-negative. The mean
-    bias of step S2, :math:`\overline{q_i^* \otimes q_O}`, equals :math:`\bar q^* \otimes q_O`,
-    because the product is linear. Its norm has no effect on the regression that follows.
+    The sign :math:`s_i` is selected so that the scalar product of :math:`s_i q_i` and the first
+    quaternion is not negative. The mean bias of step S2, :math:`\overline{q_i^* \otimes q_O}`,
+    equals :math:`\bar q^* \otimes q_O` except for its norm, because the product is linear. The norm
+    has no effect on the regression that follows.
 
     Parameters
     ----------

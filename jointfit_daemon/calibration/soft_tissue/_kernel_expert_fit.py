@@ -56,7 +56,7 @@ def fit_expert(u: Array, rho: Array, sensors: int, ways: Ways, *, tilted: bool) 
     Parameters
     ----------
     u : ndarray, shape (n, 3 m + 3)
-        Regressors: relative rotations, then tilts.
+        Regressors as returned by `model_inputs`, rad.
     rho : ndarray, shape (n, 3)
         Target corrections, rad.
     ways : sequence of sequence of ndarray of bool, shape (n,)

@@ -189,7 +189,10 @@ def _autocorrelation(values: Array) -> Array:
 
 
 def _ridge(shown: Array, wanted: Array) -> Array:
-    """Return the weights, shape (10, components); upright is zero, so there is no intercept."""
+    """Return the weights of the polynomials, shape (10, components).
+
+    There is no intercept, because polynomials and target are zero in the upright posture.
+    """
     scale = np.sqrt(np.mean(shown**2, axis=0)) + 1e-6
     g = shown / scale
     H = g.T @ g + RIDGE * len(g) * np.eye(g.shape[1])

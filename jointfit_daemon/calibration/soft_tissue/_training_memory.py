@@ -4,8 +4,7 @@ The number of frames is limited. They are spread evenly over postures, and are t
 each posture. Postures are distinguished by the direction of gravity in the first segment and by the
 joint rotations. Each of these components is divided into cells of 0.25 rad.
 
-The encoding is text. A quaternion component is rounded to 1/32767, which is
-0.003° of orientation.
+The encoding is text. A quaternion component is rounded to 1/32767, which is 0.003° of orientation.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""Center estimates from the moments of circle points, with covariance, bound and acceptance.
+"""Center estimates from the moments of points on a circle.
 
-A refused estimate names the cause and the remedy.
+An estimate contains the covariance and the Cramér-Rao bound. An estimate outside the acceptance
+limits is refused, with cause and remedy.
 """
 
 from __future__ import annotations
@@ -131,7 +132,7 @@ def publish(
         reason = "noise hides the curvature: increase the range of motion or bring cameras closer"
         return refused_circle(method, (m.x, m.y), frames, reason)
 
-    # correlation between the noise of neighbouring frames reduces the effective number of frames
+    # Correlation between the noise of successive frames reduces the effective number of frames.
     statistics = circle_statistics(m, *circle)
     alike = lagged_product(*circle) / statistics.residual if statistics.residual > 0.0 else 0.0
     wider = variance_inflation(min(max(alike, 0.0), 0.99) if isfinite(alike) else 0.0)

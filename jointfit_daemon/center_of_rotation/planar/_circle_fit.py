@@ -71,7 +71,10 @@ def polynomial(m: CircleMoments[Number], method: str) -> tuple[Number, Number, N
 
 
 def smallest_root(m: CircleMoments[float], method: str = "hyper") -> float:
-    """Return the smallest root η, found by 5 or 6 Newton steps from zero."""
+    """Return the smallest root η of the characteristic polynomial.
+
+    Newton's method from zero finds it in 5 or 6 steps.
+    """
     if method == "kasa":
         return 0.0
     A0, A1, A2, A4 = polynomial(m, method)
@@ -122,6 +125,8 @@ def circle_from_root(
         a &= (M_{xz}(M_{yy} - \eta) - M_{yz} M_{xy}) / 2\Delta \\
         b &= (M_{yz}(M_{xx} - \eta) - M_{xz} M_{xy}) / 2\Delta \\
         R^2 &= a^2 + b^2 + M_z + \{0, 2\eta, 0, -2\eta\}
+
+    The braces contain the terms of the methods ``kasa``, ``pratt``, ``taubin`` and ``hyper``.
     """
     z = m.xx + m.yy
     # Δ = η² - ηMz + C is computed as a difference of products, because the sum cancels on short

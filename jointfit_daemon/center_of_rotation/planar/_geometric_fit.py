@@ -129,13 +129,14 @@ def _accept_estimate(
     count = int(seen.sum())
     free = 2 + x.shape[1]
 
-    # variance by Huber: mean squared influence divided by the squared share of points within the
-    # bound
+    # Huber's formula of the variance: the mean squared influence, divided by the square of the
+    # fraction of points within the Huber bound.
     pull = float((w**2 * e**2)[seen].sum()) / max(count - free, 1)
     variance = pull / max(float((w[seen] >= 1.0).mean()), 0.1) ** 2
     information = np.einsum("tk,tka,tkb->ab", seen.astype(np.float64), J, J)
 
-    # noise also changes the directions; its contribution to H is not information and is subtracted
+    # Noise also changes the directions from the center to the points. The contribution of this
+    # change to H is not information and is subtracted.
     u2 = np.maximum(((x - c) ** 2).sum(axis=-1), 1e-6)
     across = np.eye(2) * float((seen / u2).sum()) - np.einsum(
         "tk,tka,tkb->ab", seen / u2**2, x - c, x - c

@@ -32,7 +32,10 @@ ROUNDING = 1e-13
 
 
 class CircleMoments(NamedTuple, Generic[Number]):
-    """Weighted moments of points about their centroid; z is the squared distance from it."""
+    """Weighted moments of points about their centroid.
+
+    z is the squared distance of a point from the centroid.
+    """
 
     weight: Number
     """Sum of the weights."""
@@ -216,10 +219,10 @@ def ellipse_scale(effective: float, conditioning: float) -> float:
     .. math:: e^T C^{-1} e \le g^2(T)\, \nu \left( 0.05^{-2/\nu} - 1 \right), \qquad \nu = n - 3
 
     The second factor is twice the quantile of the F distribution with 2 and ν degrees of freedom,
-    because the noise is also estimated. The first factor corrects the selection of published
+    because the noise is also estimated. The first factor corrects for the selection of published
     centers. A center is published if its T exceeds `GATE`. T is nearly T₀ + N(0, 1), where T₀ is
-    the true value. If T₀ is close to the gate, most published centers have too large a curvature,
-    and are therefore too close to the markers. The factor
+    the true value. If T₀ is close to the gate, the curvature of most published centers is too
+    large, so these centers are too close to the markers. The factor
 
     .. math:: g(T) = 1 + 12.6\, e^{-(T-6)/0.455} + 0.172\, (6/T)^{2.25}
 

@@ -32,9 +32,7 @@ if TYPE_CHECKING:
 METHOD = "oriented"
 MAX_FRAMES = 300
 INCONSISTENT = 13.8
-"""Squared Mahalanobis distance of two estimates that is exceeded by chance once in a thousand
-cases.
-"""
+"""Squared Mahalanobis distance of two estimates. Chance exceeds it once in a thousand cases."""
 _LEAST_NOISE_M = 1e-4
 _PASSES = 40
 _FAR_M = 1.0
@@ -200,7 +198,7 @@ def limit_center(center: Array, C: Array, circle: Circles) -> tuple[Array, Array
 
 
 def _thin(points: ArrayLike, angles: ArrayLike, interval: float) -> tuple[Array, Array, Array]:
-    """Drop missing frames and average to at most `MAX_FRAMES`."""
+    """Return the frames with marker and angle; more than `MAX_FRAMES` are averaged in groups."""
     x = np.asarray(points, dtype=np.float64).reshape(-1, 2)
     theta = np.asarray(angles, dtype=np.float64).ravel()
     seen = seen_places(x) & np.isfinite(theta)
@@ -220,7 +218,7 @@ def _path_noise(x: Array) -> float:
     circle = fit_circles(x)
     if bool(circle.valid):
         return float(circle.noise)
-    # The arc is nearly straight. The noise is measured across the path, or about a flat parabola.
+    # The arc is nearly straight. The noise is the distance of the points from a flat parabola.
     d = x - x.mean(axis=0)
     along, across = (d @ np.linalg.svd(d, full_matrices=False)[2].T).T
     terms = np.column_stack((np.ones(len(x)), along, along**2))
@@ -291,7 +289,7 @@ def _normal(
 def _accept_estimate(
     x: Array, held: tuple[Array, Array, float], alone: CenterEstimate, limits: CircleLimits
 ) -> CenterEstimate:
-    """Return a copy of the estimate `alone` with the guarded center and its acceptance."""
+    """Return the estimate `alone` with the limited center `held`, refused if outside the limits."""
     center, C, s2 = held
     radius = float(np.linalg.norm(x - center, axis=1).mean())
     largest = float(np.linalg.eigvalsh(C)[-1])

@@ -14,7 +14,7 @@ _LEAST_SPREAD_M2 = 1e-12
 
 
 def planar_noise(points: Array, parent: Array, noise: float) -> Array:
-    r"""Return the covariance of points in the coordinates of a planar frame of noisy markers.
+    r"""Return the covariance of points in a planar frame that is fitted to noisy markers.
 
     .. math:: Σ_x = σ^2 \left[ \left(1 + \tfrac1m\right) I
               + \frac{λ_⊥ λ_⊥^T}{\sum_j |d_j|^2} \right], \quad λ = x - \bar y,

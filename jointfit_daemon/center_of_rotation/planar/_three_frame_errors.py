@@ -1,9 +1,9 @@
 r"""Error of a center that is computed from three frames, from the noise of each coordinate.
 
 The marker is at distance r from the center, at the angles θ₁, θ₂, θ₃. Source: Akbarifar et al.
-2021, section 2-2-2, with corrections of these misprints. In equation 12 the denominator has a
-factor s, and a sum instead of a difference of sines. In equation 13 the terms of second order have
-the wrong sign. The mean squares are called standard deviations.
+2021, section 2-2-2. These misprints of the source are corrected here. In equation 12 the
+denominator has a factor s, and a sum instead of a difference of sines. In equation 13 the terms of
+second order have the wrong sign. The mean squares are called standard deviations.
 """
 
 from __future__ import annotations

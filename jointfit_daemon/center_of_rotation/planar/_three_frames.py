@@ -72,7 +72,10 @@ def _sides(p: Array) -> tuple[Array, Array, Array]:
 
 
 def _offset(u: Array, v: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the center from the first point, divided by the largest side, and a failure mask."""
+    """Return the vector from the first point to the center, and a mask of triples on a line.
+
+    The vector is divided by the largest side.
+    """
     D = u[..., 0] * v[..., 1] - v[..., 0] * u[..., 1]
     s2, s3 = (u**2).sum(axis=-1), (v**2).sum(axis=-1)
     longest = np.maximum(np.maximum(s2, s3), ((u - v) ** 2).sum(axis=-1))
@@ -125,7 +128,7 @@ def three_frame_estimate(points: ArrayLike, noise: ArrayLike) -> CenterEstimate:
     error = sqrt(float(np.trace(covariance)))
     radius = float(size * np.hypot(*offset))
 
-    # above this ratio noise dominates, and the mean square error is not finite
+    # If the error exceeds a sixth of the radius, the mean square error is not finite.
     lost = f"noise of {1000 * typical:.1f} mm hides the arc: choose frames further apart"
     turned = np.unwrap(np.arctan2(spokes[:, 1], spokes[:, 0]))
     return CenterEstimate(

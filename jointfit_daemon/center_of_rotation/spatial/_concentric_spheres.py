@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 _STEPS = 40
 _REWEIGHED = 6
 _NOTHING_M2 = 1e-18
-"""Noise variance below which it counts as a rounding error, m². It is one nanometer squared."""
+"""Variance below which noise counts as a rounding error, m². It is one nanometer squared."""
 _REACH_M = 1e3
 
 
@@ -42,9 +42,9 @@ class MarkerPaths:
     mean: Array
     """Mean of each path, m, shape (k, r)."""
     C: Array
-    """Covariance of the path, m², shape (k, r, r)."""
+    """Covariance of the positions x of each path, m², shape (k, r, r)."""
     c: Array
-    """Covariance of the position x with |x|², m³, shape (k, r)."""
+    """Covariance of x with |x|², m³, shape (k, r)."""
     Z: Array
     """Variance of |x|², m⁴, shape (k,)."""
     S: Array
@@ -107,8 +107,8 @@ def common_center(paths: MarkerPaths) -> ConcentricSpheres | None:
         if found is None:
             return None
 
-        # Compute the relative noise variance of each marker, without differences that are
-        # insignificant.
+        # Compute the relative noise variance of each marker. Insignificant differences between
+        # markers are reduced to zero.
         ratio = found[2] / np.maximum(relative * found[1], _NOTHING_M2) * relative
         ratio = ratio / np.median(ratio) if np.median(ratio) > 0 else np.ones_like(ratio)
         ratio = np.clip(ratio, 0.0, 1e6)

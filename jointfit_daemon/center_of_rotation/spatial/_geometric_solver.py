@@ -1,7 +1,7 @@
 """Robust geometric fit of concentric spheres.
 
-The center keeps its start value along unobservable directions. `evaluate_sphere` checks whether a
-fit is accepted.
+Along unobservable directions the center is equal to its start value. `evaluate_sphere` checks
+whether a fit is accepted.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Mask = NDArray[np.bool_]
 
 HUBER = 1.5
 NOISE_FACTOR = 6.0
-"""Ratio of the rotation to the noise of the rotation above which a direction is observed."""
+"""Ratio of the mean square rotation to its noise variance above which a direction is observed."""
 _PASSES = 30
 _ROUNDED = 1e-9
 _LONGEST_STEP_M = 0.2
@@ -49,13 +49,14 @@ class SphereOptions:
     start: Array | None = None
     """Initial center, m, shape (3,). The estimate keeps this value along unobserved directions."""
     hold: float = 0.0
-    """Noise of the markers, m. Along directions in which this noise dominates, the initial center
-    of the iteration is `start`.
+    """Noise of the markers, m. Along directions in which this noise exceeds the movement, the
+    iteration starts at `start`.
     """
     min_direction: float = 0.0
     """RMS rotation, rad, below which a direction counts as unobserved even with small noise."""
     keep_one: bool = False
-    """Whether to fit the best direction even if it is not observable."""
+    """Whether to fit at least the direction with the largest rotation, even if it is unobservable.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,8 +94,8 @@ class SphereFit:
 def solve_sphere(points: Array, options: SphereOptions) -> SphereFit:
     """Fit spheres about one center by Gauss-Newton with Huber weights; radii are eliminated.
 
-    The center keeps its start value along unobserved directions. Otherwise noise would move the
-    center to the plane of the markers, and its covariance would be too small. Source: Halvorsen
+    Along unobserved directions the center is equal to its start value. Otherwise noise would move
+    the center to the plane of the markers, and its covariance would be too small. Source: Halvorsen
     2003; Chang and Pollard 2007.
 
     Parameters
@@ -152,7 +153,10 @@ def solve_sphere(points: Array, options: SphereOptions) -> SphereFit:
 
 
 def _begin(v: Array, w: Array, start: Array, options: SphereOptions) -> Array:
-    """Return the Gamage-Lasenby center, with `start` along directions where `hold` dominates."""
+    """Return the center of Gamage and Lasenby as the initial center of the iteration.
+
+    Along directions in which the noise `hold` exceeds the movement, the result is close to `start`.
+    """
     total = np.maximum(w.sum(axis=0), 1e-12)
     d = v - start
     d = d - (w[..., None] * d).sum(axis=0) / total[:, None]

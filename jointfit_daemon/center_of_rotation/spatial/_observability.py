@@ -32,16 +32,17 @@ MIN_CONDITIONING = 6.0
 the center.
 """
 MIN_SIGNIFICANCE = 7.0
-"""Standard deviations by which the rotation in a third direction must exceed the rotation that
-noise causes. Otherwise the noise of many frames along the axis of a hinge would appear as a
-well-conditioned center.
+"""Number of standard deviations by which the rotation in a third direction must exceed the apparent
+rotation that noise causes. Otherwise the noise of many frames would seem to determine the center
+along the axis of a hinge.
 """
 FADED = 0.5 ** LAGS[1]
-"""Correlation over `LAGS[1]` frames of noise whose correlation halves from frame to frame. A larger
-correlation is attributed to soft-tissue artefact.
+"""Largest correlation over `LAGS[1]` frames that is attributed to noise. It belongs to noise whose
+correlation halves from frame to frame. A larger correlation is attributed to soft-tissue artefact.
 """
 FILLED = 0.1
-"""Fraction of the variance of the path above which the radial residuals are not noise about an arc.
+"""Largest variance of the radial residuals of a path that is an arc, as a fraction of the variance
+of the path.
 """
 _STILL_M = 1e-6
 _PERSISTENT = 0.99
@@ -55,8 +56,8 @@ class SphereLimits:
     min_direction: float = 0.0
     """RMS rotation of the markers in the third direction, rad, below which the joint counts as a
     hinge even with small noise. Use 3° with soft-tissue artefact. The value must exceed the
-    rotation of the parent's frame that noise causes, because it cannot be distinguished from joint
-    rotation.
+    rotation of the parent's frame that noise causes, because such a rotation cannot be
+    distinguished from joint rotation.
     """
     min_arc: float = radians(8.0)
     reach: tuple[float, float] = (0.02, 1.0)
@@ -113,9 +114,9 @@ def observe(
 ) -> ObservedCenter | None:
     """Fit the center, and drop the least observable direction until all others are observable.
 
-    The fit omits directions that noise dominates. It includes directions that only soft-tissue
-    artefact excites, because the residuals would be larger without these directions. The result
-    does not contain the directions of the artefact.
+    A direction is dropped if its rotation is not significantly larger than noise. Directions that
+    are observable only without soft-tissue artefact remain in the fit, because the residuals would
+    be larger without them. `ObservedCenter.shown` does not contain these directions.
     """
     while basis.shape[1] >= 2:
         flat = paths.seen_along(basis)
@@ -124,7 +125,7 @@ def observe(
             basis = basis @ np.linalg.eigh(np.einsum("j,jab->ab", flat.n, flat.C))[1][:, 1:]
             continue
 
-        # largest plausible information from noise in the least observed direction, rad²
+        # Largest information that noise alone may cause in the least observed direction, rad².
         spread, axes = np.linalg.eigh(found.information)
         radius2 = float(np.median(found.radii2))
         noise = max(MIN_CONDITIONING**2 * found.noise2 / radius2, 0.0)
@@ -135,8 +136,8 @@ def observe(
             noise = max(noise, chance, limits.min_direction**2 * total)
 
         if spread[0] > noise:
-            # If the paths fill an area that is as wide as it is long, they are a small movement on
-            # a sphere, in a projection along the radius. The curvature cannot be measured, and a
+            # If the paths fill an area that is as wide as it is long, they are the projection of a
+            # small movement on a sphere along its radius. The curvature cannot be measured, and a
             # fitted circle is meaningless.
             wide = np.linalg.eigvalsh(np.einsum("j,jab->ab", flat.n / flat.n.sum(), flat.C))[-1]
             if found.noise2 * float(np.median(found.relative)) > FILLED * wide:
@@ -159,7 +160,9 @@ def observe(
 def soft_tissue_variance(
     left: ResidualStatistics, paths: MarkerPaths, found: ConcentricSpheres
 ) -> float:
-    r"""Return the variance of the soft-tissue artefact, m²; the caller divides by information.
+    r"""Return the variance of the soft-tissue artefact, m².
+
+    The caller multiplies it by the inverse of the information.
 
     .. math:: \mathrm{Cov}_{posture} = p^2 \left[ \overline{u u^T} - \bar u \bar u^T \right]^{-1}
 
@@ -178,7 +181,7 @@ def posture_share(lasting: float, frames: float) -> float:
     The fraction is the correlation of the residuals over `LAGS[1]` frames. It is zero if this
     correlation is below the 99.7 % quantile of the correlation of noise.
     """
-    # a correlation ρ per frame divides the effective frames by (1 + ρ²)/(1 - ρ²)
+    # A correlation ρ per frame divides the effective number of frames by (1 + ρ²)/(1 - ρ²).
     chance = FADED + 3.0 * float(np.sqrt((5.0 / 3.0) / max(frames, 1.0)))
     return min(lasting, 1.0) if lasting > chance else 0.0
 
@@ -231,7 +234,7 @@ def _observed_center(
     bread = np.linalg.inv(found.information)
     dof = max(total * (1.0 - rho) / (1.0 + rho) - k - rank, 2.0)
 
-    # a fit removes more of persistent noise than of white noise from the residuals
+    # A fit reduces residuals of persistent noise more than residuals of white noise.
     own = total * (1.0 - both) / (1.0 + both)
     widened = total / max(own - k - rank, 1.0)
     bound2 = found.noise2 * float(np.trace(bread))
@@ -239,7 +242,7 @@ def _observed_center(
     spread = spread + soft_tissue_variance(left, paths, found) * bread
     path = np.einsum("j,jab->ab", paths.n / found.relative, paths.C)
 
-    # variance of the normal of a plane through the paths
+    # Variance of the normal of a plane that is fitted to the paths.
     tilt = (found.noise2 + soft_tissue_variance(left, paths, found)) * np.linalg.inv(path)
     size = within95(shown.shape[1], dof)
     return ObservedCenter(basis, shown, paths, found, spread, tilt, bound2, left, size)
@@ -285,7 +288,7 @@ def _residuals(
     power = float(share @ np.diagonal(together))
     rho, lasting = (lagged @ share / max(power, 1e-300)).tolist()
 
-    # a correlation below the sampling error of white noise is treated as zero
+    # A correlation below the sampling error of white noise is set to zero.
     rho = min(rho, _PERSISTENT) if rho > 2.0 / np.sqrt(paths.n.sum()) else 0.0
     posture = posture_share(lasting, float(paths.n.mean())) if limits.posture else 0.0
     return ResidualStatistics(together, rho, posture)

@@ -77,7 +77,7 @@ def turn_noise(parent: Array, noise: float) -> float:
 
 
 def relative(points: Array, parent: Array, center: Array) -> Array:
-    r"""Return the relative noise covariance of each marker, whose radial part is 1.
+    r"""Return the noise covariance of each marker, scaled so that its mean radial variance is 1.
 
     .. math:: S_j = Σ_c / \overline{\hat r_j^T Σ_c \hat r_j}, \qquad
               Σ_c = \left(1 + \tfrac1m\right) I + [λ_c]_× G^{-1} [λ_c]_×^T

@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
 
 OUTLIER = 3.0
-"""Residual in standard deviations above which the weight of a marker is reduced. The threshold is
-larger than the usual 1.5, because a frame is weighted only once, and the noise estimate must not
-decrease.
+"""Residual, in standard deviations, above which the weight of a marker is reduced. The threshold is
+larger than the usual 1.5. The weights of a frame are not revised later, and with a smaller
+threshold the estimated noise would decrease from frame to frame.
 """
 OFF = 8.0
 """Residual, in standard deviations, above which a marker is off its sphere; it must also exceed
@@ -66,7 +66,7 @@ class _ExpectedMarkers:
 
 
 class RunningSphere:
-    """Center of rotation of several markers, which processes frame by frame.
+    """Center of rotation of several markers, updated frame by frame.
 
     Parameters
     ----------
@@ -81,8 +81,8 @@ class RunningSphere:
         Position of the center along unobserved directions, m.
     robust : bool
         Whether to reduce the weight of markers that leave their sphere because of soft-tissue
-        artefact or exchanged labels. A marker that remains off its sphere is then restarted. The
-        last call of `estimate` determines the spheres.
+        artefact or exchanged labels. The sums of a marker that remains off its sphere are then
+        reset. The last call of `estimate` determines the spheres.
     limits : SphereLimits, optional
         Acceptance limits. If None, persistent residuals are not counted as soft-tissue artefact,
         and the caller adds the variance of the artefact. Pass ``SphereLimits()`` to count the
@@ -214,7 +214,7 @@ class RunningSphere:
         w = np.where(near, 1.0 if given is None else given, 0.0)
         if fine.all():
             return self._restart(w, np.isfinite(phi[:, 0]) & ~near)
-        # at new positions of a marker the uncertainty of the center increases the tolerance
+        # The uncertainty of the center increases the tolerance of a marker far from its mean.
         way = np.where(near[:, None], phi[:, 1:-1] - expected.mean, 0.0)
         excused = np.einsum("ja,jab,jb->j", way, expected.unsure, way)
         scale = np.sqrt(expected.noise**2 + np.maximum(excused, 0.0))
@@ -225,7 +225,10 @@ class RunningSphere:
         return self._restart(w, off | (np.isfinite(phi[:, 0]) & ~near))
 
     def _restart(self, w: Array, off: NDArray[np.bool_]) -> Array:
-        """Restart markers that remained off their sphere because of slip or exchanged labels."""
+        """Reset markers that remained off their sphere; return the weights without these markers.
+
+        Causes are slip and exchanged labels.
+        """
         self._off = np.where(off, self._off + 1, np.where(w > 0.0, 0, self._off))
         k, e = self._phi.shape
         for j in np.flatnonzero(self._off >= STAYED_OFF):

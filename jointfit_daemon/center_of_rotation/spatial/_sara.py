@@ -36,8 +36,8 @@ def fit_axis(
     parent, child : BodyPoses
         Poses of both bodies in the same world coordinates.
     near : ndarray, shape (3,), optional
-        Point in the parent's coordinates, m, nearest to which the center is placed on the axis.
-        None is the parent's origin.
+        Point in the parent's coordinates, m. The center is the point of the axis that is nearest to
+        this point. None is the parent's origin.
     toward : ndarray, shape (3,), optional
         Direction along which the axis has a positive component, such as the subject's right.
     robust : bool

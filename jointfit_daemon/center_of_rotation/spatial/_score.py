@@ -104,11 +104,11 @@ def two_sided_estimate(
     parent, child : BodyPoses
         Poses of both bodies in the same world coordinates; frames with NaN are ignored.
     near : ndarray, shape (3,), or None
-        Point in the parent's coordinates, m, nearest to which the center is placed on the axis of a
-        hinge. None is the parent's origin.
+        Point in the parent's coordinates, m. The center of a hinge is the point of the axis that is
+        nearest to this point. None is the parent's origin.
     hinge : bool
-        Whether to solve for an axis in any case, without the sixth singular value. If False, the
-        result is an axis only if the ratio of the last two singular values is below `HINGE_RATIO`.
+        Whether to solve always for an axis, without the sixth singular value. If False, the result
+        is an axis only if the ratio of the last two singular values is below `HINGE_RATIO`.
     robust : bool
         Whether to apply Huber weights to the gap between the points of both bodies. The weights
         reduce the influence of exchanged markers.
@@ -147,7 +147,7 @@ def two_sided_estimate(
     if hinge and ratio >= HINGE_RATIO:
         return refusal(name, 3, n, SEVERAL_AXES.format(ratio))
 
-    # for unit noise of the gap, score S and information M are both NᵀWN
+    # If the gap has unit noise, score S and information M are both NᵀWN.
     squares = np.diag(s[:rank] ** 2)
     residual = sqrt(float((gaps**2).sum(axis=1).mean()))
     fit = TwoSidedFit(c, gaps, w, residual, squares, squares)
@@ -155,8 +155,7 @@ def two_sided_estimate(
         noise = ClusterNoise.of(markers[0]), ClusterNoise.of(markers[1])
         fit = fit_two_sides(poses, noise, c, Vt[:rank].T, robust=robust)
 
-    # The arc is that of the direction that rotated most. The resultant is the length of the mean
-    # direction.
+    # The arc is computed from the direction that rotated most, which has the shortest mean vector.
     R = rotation.to_matrix(rotation.multiply(rotation.conjugate(poses[0].q), poses[1].q))
     arc = arc_of(float(np.linalg.svd(R.mean(axis=0))[1][2]))
     found = _answer(name, fit, Vt, arc, near, posture=posture)
@@ -181,7 +180,7 @@ def _answer(
     inverse = Vt[:rank].T @ inner @ Vt[:rank]
     white, C, rho, repeated = _covariances(fit, inverse, rank, posture=posture)
 
-    # a hinge: the direction along the axis is unobserved
+    # The rank 5 means a hinge, for which the direction along the axis is unobserved.
     axis = Vt[5, :3] / np.linalg.norm(Vt[5, :3]) if rank == 5 else None
     center = fit.point[:3]
     if axis is not None:
@@ -217,11 +216,12 @@ def _answer(
 def _covariances(
     fit: TwoSidedFit, inverse: Array, rank: int, *, posture: bool
 ) -> tuple[Array, Array, float, float]:
-    """Return the covariance of the parent's point for white noise, and the total covariance, m².
+    """Return two covariances of the parent's point, m², a correlation and a fraction.
 
-    The third value is the correlation of the gaps from one frame to the next. Persistent noise
-    reduces the effective number of frames; with soft-tissue artefact this number is one. The fourth
-    value is the fraction of the gap variance that repeats with posture.
+    The covariances are the covariance for white noise and the total covariance. The third value is
+    the correlation of the gaps from one frame to the next, which reduces the effective number of
+    frames. The fourth value is the fraction of the gap variance that repeats with posture. For this
+    fraction all frames together count as one.
     """
     gaps, w = fit.gaps, fit.weights
     n = len(gaps)

@@ -70,7 +70,7 @@ def center_of(
         Position of the center along unobserved directions, m; the mean of the markers if None.
     shape : ndarray, shape (k, d, d), optional
         Noise covariance of each marker relative to the common variance; isotropic noise if None.
-        ``relative`` returns it for a moving parent.
+        For a moving parent, ``relative`` returns these covariances.
     limits : SphereLimits, optional
         Acceptance limits.
 
@@ -118,7 +118,7 @@ def _answer(
     stay = middle if near is None else np.asarray(near, dtype=np.float64)
     center, spread = shrink_center(seen, middle @ seen.basis)
     fitted = seen.basis @ center
-    hidden = unseen @ seen.basis @ seen.basis.T  # not in the result
+    hidden = unseen @ seen.basis @ seen.basis.T  # fitted, but not part of the result
     lean = float(((unseen @ stay - hidden @ fitted - (unseen - hidden) @ middle) ** 2).sum())
     spread = seen.shown.T @ spread @ seen.shown
     C = basis @ (spread + lean * (seen.shown.T @ seen.tilt @ seen.shown)) @ basis.T

@@ -51,7 +51,7 @@ def gamage_lasenby(points: Array, min_direction: float = 0.0) -> CenterEstimate:
     points : ndarray, shape (n, k, 3)
         Markers of the child in the parent's coordinates, m; NaN where not seen.
     min_direction : float
-        RMS rotation, rad, below which a direction is unobserved and the estimate refused.
+        RMS rotation, rad, below which a direction is unobserved and the estimate is refused.
     """
     return _linear(points, "gamage_lasenby", 0, min_direction)
 

@@ -1,4 +1,6 @@
-r"""Sums over any number of frames that are sufficient for a fit of spheres; their size is fixed.
+r"""Sums over the frames of a movement, from which spheres can be fitted without the frames.
+
+The size of the sums does not depend on the number of frames.
 
 Every marker has the vector φ = (|p|², p, 1), where p is the position of the marker relative to a
 fixed point near the marker. All estimates of spheres about one center are functions of
@@ -25,8 +27,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 LAGS = (1, 4)
-"""Lags in frames. The second is large enough that noise whose correlation halves from frame to
-frame has decayed.
+"""Lags in frames. Noise whose correlation halves from frame to frame is almost uncorrelated over
+the second lag.
 """
 
 

@@ -1,9 +1,10 @@
 r"""Center of two bodies whose poses are fitted to noisy markers.
 
 Noise of the markers rotates the fitted bodies, and moves a point in proportion to its distance from
-the markers. A least-squares fit of the gap between both bodies (SCoRE) is therefore biased towards
-the markers. The bias is millimeters in small movements. The fit of this module estimates the errors
-of both rotations in every frame together with the center (errors in variables).
+the markers. SCoRE, a least-squares fit of the gap between the points of both bodies, is therefore
+biased towards the markers. The bias is some millimeters in small movements. The fit of this module
+estimates the errors of both rotations in every frame together with the center (errors in
+variables).
 """
 
 from __future__ import annotations
@@ -67,7 +68,8 @@ class TwoSidedFit:
     point: Array
     """Point in parent and in child coordinates, m, shape (6,)."""
     gaps: Array
-    """Gaps divided by the standard deviation that unit noise causes, m, shape (n, 3)."""
+    """Gap in each frame divided by the standard deviation that unit noise causes, m, shape (n, 3).
+    """
     weights: Array
     """Weight of each frame, shape (n,)."""
     residual: float

@@ -1,7 +1,7 @@
 r"""Comparison of the three-frame solution with geometric methods, for the same range of motion.
 
-Two markers of a rigid body rotate by 2α. Both are at the same distance from the center, `APART_RAD`
-apart. Methods that need two frames use the first and the last frame.
+Two markers of a rigid body rotate by 2α. Both are at the same distance from the center, and the
+angle between them is `APART_RAD`. Methods that need two frames use the first and the last frame.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 APART_RAD = np.pi / 3.0
 """Angle between the two markers about the center, rad."""
 _LEAST_TURN = 1e-12
-"""Rotation below which it counts as a rounding error, rad."""
+"""Angle below which a rotation counts as a rounding error, rad."""
 
 
 def bisector_center(points: ArrayLike) -> Array:

@@ -77,7 +77,7 @@ def oriented_centers(points: Array, angles: Array, interval: float = 0.02) -> Ar
     noise = np.maximum(noise, _LEAST_NOISE_M)
     found, H = start, np.zeros((len(z), 4, 4))
 
-    # the scale error uses angles without noise, which increase evenly from frame to frame
+    # The covariance of the scale error uses the true angles, which increase evenly.
     values, U = _is_wandering(n, interval)
     even = np.arange(n) - 0.5 * (n - 1)
     g = _TOLD.gain * np.outer(theta @ even, even) / (even @ even)
@@ -168,7 +168,7 @@ def _cost(runs: _Runs, at: Array) -> tuple[Array, Array, Array]:
 
 
 def _limit_centers(center: Array, H: Array, circles: Circles) -> Array:
-    """Limit the distance of the centers from the circle fits, as `guarded` does for one run."""
+    """Limit the distance of the centers from the circle fits, like `limit_center` for one run."""
     C = np.linalg.inv(H + 1e-9 * H * np.eye(4))[:, :2, :2]
     held = circles.valid & (circles.noise > _LEAST_NOISE_M)
     of_circle = np.where(held[:, None, None], circles.covariance, np.eye(2))
