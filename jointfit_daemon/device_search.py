@@ -95,8 +95,8 @@ class ServerSearch(Protocol):
         Parameters
         ----------
         hosts
-            Names or addresses of hosts to query. These hosts are also asked for the names of their
-            rigid bodies and markers.
+            Names or addresses of hosts to query. The names of rigid bodies and markers are also
+            requested from these hosts.
         broadcast
             Whether to query all hosts in the networks of this host.
         port

@@ -128,8 +128,8 @@ def _beyond_parent(found: CenterEstimate, parent: Array | None) -> CenterEstimat
     if found.arc / 4.0 > turn:
         return found
     why = (
-        f"the joint turned {degrees(found.arc):.0f}°, which noise of the parent's markers may be: "
-        "move it further, or put the parent's markers further apart"
+        f"the joint turned {degrees(found.arc):.0f}°, which may be only noise of the parent's "
+        "markers: move the joint further, or put the parent's markers further apart"
     )
     return replace(found, refused=why)
 
@@ -158,14 +158,14 @@ def _circle(name: CircleMethod, about: str) -> EstimationMethod:
 
 _ALL = (
     _circle("kasa", "linear circle fit; biased on short arcs"),
-    _circle("pratt", "algebraic circle fit; the center is hyper's"),
+    _circle("pratt", "algebraic circle fit with the same center as hyper"),
     _circle("taubin", "algebraic circle fit, nearly unbiased"),
     _circle("hyper", "algebraic circle fit without essential bias"),
     _planar("geometric", "circles of all markers at once, robust", _planar_methods.geometric),
-    _planar("running_circle", "hyper, one frame at a time", each(_planar_methods.running)),
+    _planar("running_circle", "hyper, updated frame by frame", each(_planar_methods.running)),
     _planar(
         "oriented",
-        "circle and the child's measured angle",
+        "circle fit that also uses the measured angle of the child",
         each(_planar_methods.fit_oriented),
         "angles",
     ),
@@ -180,7 +180,7 @@ _ALL = (
     ),
     EstimationMethod(
         "halvorsen",
-        "linear sphere fit, bias taken out",
+        "linear sphere fit, corrected for its bias",
         ("points",),
         False,
         lambda m, points: halvorsen(points, m.least_turn),
@@ -199,21 +199,21 @@ _ALL = (
     ),
     EstimationMethod(
         "running_sphere",
-        "spheres of all markers one frame at a time; distinguishes a hinge from a ball joint",
+        "sphere fit of all markers, updated frame by frame; distinguishes hinge and ball joint",
         ("points",),
         True,
         _stream,
     ),
     EstimationMethod(
         "score",
-        "both bodies treated alike; needs three markers on each",
+        "point that is fixed in both bodies; needs three markers on each body",
         ("parent", "child"),
         False,
         lambda m, parent, child: fit_score(parent, child, near=m.near, markers=m.both_markers()),
     ),
     EstimationMethod(
         "sara",
-        "axis of a hinge from both bodies",
+        "axis of a hinge that is fixed in both bodies",
         ("parent", "child"),
         False,
         lambda m, parent, child: fit_axis(

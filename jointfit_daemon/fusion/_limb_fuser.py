@@ -76,9 +76,7 @@ class LimbFuser:
         self._chain, self._drifting = chain, drifting
         self.sensor_monitor = sensor_monitor or SensorMonitor(chain)
         self.worn = True
-        """Whether the sensors are on the body. Sensors on the calibration plate are not compared
-        with each other.
-        """
+        """Whether the sensors are on the body; on the calibration plate no pairs are compared."""
         usable = calibration is not None and calibration.fits(chain)
         self._uncorrected = calibration is not None and calibration.procedure == "patent"
         """Whether sensors are used without correction, even if they have faults."""
@@ -155,14 +153,19 @@ class LimbFuser:
 
         Notes
         -----
-        The flags have this order: ``uncalibrated``, ``other_chain``, the flags of the calibration,
-        ``extrapolating`` (a sample is extrapolated in time), ``origin_fixed`` (mocap runs but O1 is
-        not visible, so the configured origin is used), ``stuck:SENSOR``, ``slipped:SENSOR`` or
-        ``pair_disagrees:SEGMENT``, ``heading_disagrees:JOINT``, ``heading_unseen``, and per segment
-        ``one_sensor:``, ``untrained:`` (outside the training range), ``held:``, ``lost:``;
-        ``gimbal`` is last. In the procedure of the patent, ``uncorrected`` follows the flags of the
-        calibration. Fault flags then only report the faults, and the sensors are used without
-        correction.
+        The flags have this order:
+
+        1. ``uncalibrated`` and ``other_chain``, or the flags of the calibration;
+        2. ``uncorrected`` in the procedure of the patent, where the following fault flags only
+           report the faults, and the sensors are used without correction;
+        3. ``extrapolating`` if an orientation is extrapolated in time;
+        4. ``origin_fixed`` if mocap runs, but O1 is not visible, so the configured origin is used;
+        5. ``stuck:SENSOR``;
+        6. ``slipped:SENSOR`` or ``pair_disagrees:SEGMENT``;
+        7. ``heading_disagrees:JOINT``, then ``heading_unseen``;
+        8. for each segment ``one_sensor:SEGMENT``, ``untrained:SEGMENT`` (outside the training
+           range), ``held:SEGMENT`` or ``lost:SEGMENT``;
+        9. ``gimbal``.
         """
         working, stuck = self.sensor_monitor.update(t_ns, completed_ns, orientations)
         orientations = orientations if self._uncorrected else working

@@ -88,7 +88,7 @@ def chosen_center(
         parent, child, turned = child, parent, turned[::-1]
     frames = int(np.count_nonzero(visible(parent.q) & visible(child.q)))
     if frames < MIN_FRAMES:
-        reason = f"{frames} frames show both sides of it, at least {MIN_FRAMES} are needed"
+        reason = f"{frames} frames show both body parts, at least {MIN_FRAMES} are needed"
         return refusal(method, 3, frames, reason)
 
     # The origin of both parts is `start`, which is near the joint. The positions of a distant

@@ -215,10 +215,10 @@ def _check(estimate: GyroscopeScaleEstimate) -> None:
     """Reject scale factors that the turns do not determine."""
     if estimate.residual > LARGEST_RESIDUAL:
         raise SensorCalibrationError(
-            f"the turns by the gyroscope end {degrees(estimate.residual):.1f} deg (RMS) from "
-            "gravity by the accelerometer, expected less than "
-            f"{degrees(LARGEST_RESIDUAL):g}: check unit and range of the rate in rig.toml, and "
-            "turn the sensor more slowly"
+            "the directions of gravity computed from the gyroscope and measured by the "
+            f"accelerometer differ by {degrees(estimate.residual):.1f} deg (RMS), expected less "
+            f"than {degrees(LARGEST_RESIDUAL):g}: check unit and range of the rate in rig.toml, "
+            "and turn the sensor more slowly"
         )
     deviations = np.diag(estimate.matrix_sd)
     axis = int(np.argmax(deviations))
@@ -232,7 +232,7 @@ def _check(estimate: GyroscopeScaleEstimate) -> None:
     error = np.abs(np.diag(estimate.matrix) - 1.0).max()
     if error > LARGEST_SCALE_ERROR:
         raise SensorCalibrationError(
-            f"scale error {100 * error:.0f} %, expected at most {100 * LARGEST_SCALE_ERROR:.0f}: "
+            f"scale error {100 * error:.0f} %, expected at most {100 * LARGEST_SCALE_ERROR:.0f} %: "
             "check the unit of the rate in rig.toml, or replace the sensor"
         )
 

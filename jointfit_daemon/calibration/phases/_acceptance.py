@@ -31,9 +31,9 @@ def compare_calibrations(new: Calibration, old: Calibration | None) -> Calibrati
 
     The first criterion in which the calibrations differ determines the result. The criteria are, in
     this order, the chain, the use of cameras, the alignment of the worlds, and all errors together.
-    The errors are the hold-out errors of each segment and of the flexion of each inner joint, and
-    the gap between the centers fixed in the two body parts of a joint. A hold-out error may be
-    larger by the factor 1.15 plus 0.3°, and a gap by 5 mm.
+    An error is the hold-out error of a segment or of the flexion of an inner joint, or the gap
+    between the two centers of a joint, which are fixed in its two body parts. A hold-out error may
+    be larger by the factor 1.15 plus 0.3°, and a gap by 5 mm.
     """
     if old is None:
         return CalibrationComparison(True, "no calibration was in force")

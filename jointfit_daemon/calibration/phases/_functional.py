@@ -203,7 +203,7 @@ def _tracks(
         if misfit > MIN_SEEN:
             reasons.append(
                 f"{segment}: in {100 * misfit:.0f} % of the trial its markers do not fit the "
-                "static pose; check their names, and whether one was displaced, and repeat it"
+                "static pose; check their names and whether one was displaced, and repeat the pose"
             )
             continue
         share = float(visible(tracks[segment].q).mean()) if segment in tracks else 1.0

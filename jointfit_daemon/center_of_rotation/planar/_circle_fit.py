@@ -252,7 +252,7 @@ def fit_circle(points: ArrayLike, *, method: CircleMethod = "hyper") -> tuple[fl
     p = np.asarray(points, dtype=np.float64)
     m = moments_of_one(p) if len(p) > 2 else None
     if m is None or not m.xx * m.yy - m.xy * m.xy > ROUNDING * (m.xx + m.yy) ** 2:
-        raise ValueError("no circle: three points or more are needed, seen and not on a line")
+        raise ValueError("no circle: at least three points that are not on a line are needed")
     found = circle_of(m, method)
     if found is None:
         raise ValueError("no circle: the points show no arc")

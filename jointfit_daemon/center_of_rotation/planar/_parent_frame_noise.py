@@ -46,7 +46,7 @@ def planar_noise(points: Array, parent: Array, noise: float) -> Array:
     middle = parent.mean(axis=0)
     spread = float(((parent - middle) ** 2).sum())
     if len(parent) < 2 or spread < _LEAST_SPREAD_M2:
-        raise ValueError("a frame in a plane needs two markers that are apart: move one aside")
+        raise ValueError("a frame in a plane needs two markers at different positions: move one")
 
     lever = np.asarray(points, dtype=np.float64) - middle
     across = np.stack((-lever[..., 1], lever[..., 0]), axis=-1)

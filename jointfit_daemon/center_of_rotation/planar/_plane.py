@@ -26,7 +26,7 @@ def plane_of(axis: ArrayLike) -> Array:
     n = np.asarray(axis, dtype=np.float64)
     length = float(np.linalg.norm(n))
     if not length > 0.0:
-        raise ValueError("an axis needs a length: (0, 0, 0) has no plane across it")
+        raise ValueError("the axis is (0, 0, 0), expected a vector with a length above 0")
     n = n / length
     # y is nearly perpendicular to typical flexion axes; z is used if the axis is close to y
     guide = np.eye(3)[1 if abs(n[1]) < 0.9 else 2]

@@ -1,7 +1,7 @@
 """Observable directions of a center, and its covariance along them.
 
-A direction is observable under two conditions. The markers rotated in this direction by more than
-the noise, and the standard deviation of the center in this direction is below a sixth of the
+A direction is observable if two conditions hold. The markers rotated in this direction by more than
+noise explains. The standard deviation of the center in this direction is below a sixth of the
 radius. The covariance is increased for residuals that persist between frames and for noise that is
 common to markers. Soft-tissue artefact repeats with posture, so all frames together count as one
 observation of the artefact.

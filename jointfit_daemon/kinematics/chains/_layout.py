@@ -58,8 +58,8 @@ class ChainLayout:
     moves: Array
     """Matrix with 1 where a degree of freedom moves a segment, shape (S, nq)."""
     lower: Array
-    """Matrix, shape (nq, nq), with 1 where the column index is at most the row index, and the
-    segment of the column is the segment of the row or one of its ancestors.
+    """Matrix, shape (nq, nq), with 1 on and below the diagonal if the segment of the column is the
+    segment of the row or an ancestor of this segment.
     """
     strictly_lower: Array
     """Matrix `lower` without its diagonal."""

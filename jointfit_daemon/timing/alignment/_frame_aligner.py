@@ -15,9 +15,9 @@ The first of these frames is emitted when every stream counts as lost, the other
 delay. Frames are skipped only if the whole process was stopped for more than a second, so that the
 caller did not request them.
 
-In mode ``fast`` the last sample of a stream may precede t_k by up to one period of the stream, and
-the orientation is extrapolated to t_k. Frames are therefore emitted up to one period earlier, but
-never before t_k.
+In mode ``fast`` a frame is complete if the last sample of each stream precedes t_k by at most one
+period of the stream. The orientation is extrapolated to t_k. Frames are therefore emitted up to one
+period earlier than in mode ``smooth``, but never before t_k.
 """
 
 from __future__ import annotations
