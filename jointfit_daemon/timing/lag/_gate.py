@@ -8,10 +8,10 @@ remedy, and appears in ``tracked_refused`` and ``quality.lag.ID.refused``. The c
 3. The fit passes every threshold of `LagSettings`, and no other lag fits nearly as well
    (`fit_fault`).
 
-The thresholds depend on the phase: the defaults of `LagSettings` are for live tracking,
-``calibration/registration/_lags.py`` has those of plate and body. Two other decisions are not made
-here: ``_tracker`` finds steps of accepted lags, and ``pipeline/sources/_lag_monitor.py`` reports
-lags that contradict the lag in use.
+The thresholds depend on the phase. The defaults of `LagSettings` are for live tracking.
+``calibration/registration/_lags.py`` contains the thresholds for the plate and for sensors on skin.
+Two other decisions are not made here. ``_tracker`` detects steps of accepted lags, and
+``pipeline/sources/_lag_monitor.py`` reports lags that contradict the lag in use.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class LagSettings:
 
 
 def motion_fault(rate: float, acceleration: float, settings: LagSettings) -> str | None:
-    """Return the reason for a refusal if the markers move too little, or None.
+    """Return the reason for a refusal if the reference moves too little, or None.
 
     `rate` and `acceleration` are RMS values of the reference, rad/s and rad/s².
     """
@@ -90,7 +90,8 @@ def fit_fault(
 ) -> str | None:
     """Return the reason for a refusal from the first condition that the fit fails, or None.
 
-    `rival` is another lag that fits nearly as well, `valid_share` the fraction without gaps.
+    `rival` is another lag that fits nearly as well, or None. `valid_share` is the fraction of the
+    window without gaps.
     """
     sigma_ns, bias = 1e9 * fit.sigma_s, float(np.degrees(np.linalg.norm(fit.bias)))
     conditions = (
