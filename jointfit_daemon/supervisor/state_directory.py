@@ -43,8 +43,8 @@ def lock_state(directory: Path) -> int | None:
     """Lock `directory` for this process, and return the descriptor that owns the lock.
 
     Return None if no lock file can be created, because a directory without write access contains no
-    state to protect. Also return None if the file system has no locks, as some network file systems
-    do.
+    state to protect. Some network file systems have no locks. On these, the descriptor of the file
+    is returned without a lock.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """CSV files of Xsens / Movella DOT sensors, written by the app or the exporter, one per sensor.
 
 Lines ``NAME:,VALUE`` precede the column names. The reader uses ``DeviceTag``, ``OutputRate`` and
-``SyncStatus``. ``SampleTimeFine`` numbers the rows with 32 bits in units of 1 µs, so it wraps after
+``SyncStatus``. ``SampleTimeFine`` is a 32-bit time of the row in units of 1 µs, so it wraps after
 71.6 minutes. Angular rates are in degrees per second. The world is east, north, up; quaternions
 convert from sensor to world. Output modes without rates contain increments ``dq`` and ``dv`` for
 each row. An increment divided by its period is the mean rate. Source: header and columns of
@@ -48,7 +48,7 @@ _WORDS = ("Quat", "Euler", "FreeAcc", "Acc", "Gyr", "Mag", "dq", "dv", "Status")
 
 
 class _DotFile(NamedTuple):
-    """Data of one sensor, and the values in the header of its file."""
+    """Data of one sensor, its time at the first row, and whether it was synchronized."""
 
     first_ticks: float
     synchronized: bool
@@ -66,8 +66,8 @@ def read_dot_session(files: Sequence[Path], name: str) -> SessionData:
     """Return the sensors of one recording, from one CSV file for each sensor.
 
     Files of synchronized sensors have a common time, whose 0 s is the earliest row of all files.
-    Without synchronization, every sensor begins at 0 s. The id of a sensor is its ``DeviceTag``, or
-    the file name if there is none.
+    Without synchronization, every sensor begins at 0 s. The id of a sensor is its ``DeviceTag``. If
+    a file has no tag, its name is the id. If an id occurs twice, the file names are the ids.
 
     Raises
     ------

@@ -159,7 +159,8 @@ def read_mot_session(path: Path) -> SessionData:
     """Return the joints of a MOT or STO file with one number in each cell.
 
     In files of other programs, every column becomes a joint with one angle, called ``angle``.
-    Position columns are the exception: ``NAME_tx``, ``NAME_ty`` and ``NAME_tz``, in m with y up.
+    Position columns are the exception, in m with y up: ``NAME_tx``, ``NAME_ty`` and ``NAME_tz``, or
+    ``NAME_x``, ``NAME_y`` and ``NAME_z``.
     """
     table = read_sto(path)
     facts = header_facts(table.header)

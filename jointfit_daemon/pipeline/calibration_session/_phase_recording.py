@@ -44,7 +44,7 @@ class PhaseRecording:
     start_ns : int
         Host time of the start.
     wanted_s : float
-        Required duration, s.
+        Required duration, s; for ``functional``, the longest duration.
     guide : MovementGuide, optional
         Guide of a functional phase.
     min_s : float
@@ -120,7 +120,10 @@ class PhaseRecording:
     def _guided_progress(
         self, guide: MovementGuide, elapsed_s: float, silent: list[str]
     ) -> tuple[float, str, dict[str, object]]:
-        """Return the progress of a functional phase, which is 1 when all conditions hold."""
+        """Return the progress of a functional phase.
+
+        It is 1 when all conditions hold, or after the longest duration.
+        """
         latest = {name: q for name, q in self._latest.items() if name not in silent}
         look = self._look = guide.update(latest, elapsed_s)
         data: dict[str, object] = {

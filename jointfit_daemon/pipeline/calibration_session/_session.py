@@ -196,7 +196,10 @@ class CalibrationSession:
         return outputs
 
     def restart_sensor(self, t_ns: int, sensor: str) -> list[Output]:
-        """Discard the static pose, because a restart may change the heading of the sensor."""
+        """Discard the static pose, and abort the phase or fit that uses the sensor.
+
+        The restart may have changed the heading of the sensor.
+        """
         recording, fit = self._recording, self._fit
         moving = recording is not None and recording.phase != CalibrationPhase.STATIC
         # The result of a functional phase remains valid; the notice requests a new static pose.

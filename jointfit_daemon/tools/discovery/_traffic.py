@@ -95,7 +95,7 @@ def decode_stream(
     other_than: str = "",
     layouts: Layouts | None = None,
 ) -> tuple[DecodedDevice, ...]:
-    """Return one device for each driver that decodes a byte stream, most samples first.
+    """Return one device for each driver and table that decode a byte stream, most samples first.
 
     Parameters
     ----------

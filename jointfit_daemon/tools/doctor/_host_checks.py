@@ -78,7 +78,7 @@ def check_memory(host: Host) -> Iterator[Finding]:
 
 
 def check_processor(host: Host) -> Iterator[Finding]:
-    """Yield a warning if the governor keeps the processor at its lowest frequency."""
+    """Yield the finding on the frequency governor, which may keep the lowest frequency."""
     for folder in sorted((host.root / "sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq")):
         governor = read_attribute(folder / "scaling_governor")
         driver = read_attribute(folder / "scaling_driver")

@@ -39,7 +39,7 @@ _ID_STEP = 0x100
 
 
 def sensor_rate(answers: Given, _found: Found, _subject: str) -> Any:
-    """Return the rate of the poses, Hz, if a sensor supports this rate."""
+    """Return the rate of the poses, Hz, if it is a usual rate of sensors; otherwise 100 Hz."""
     rate = answers["output_rate_hz", ""]
     return rate if rate in (50, 100, 200, 400) else 100
 
@@ -67,7 +67,7 @@ def devices(answers: Given, found: Found, _sensor: str) -> tuple[FoundDevice, ..
 
 
 def device(answers: Given, found: Found, sensor: str) -> str | None:
-    """Return the device if exactly one device is unused; None otherwise."""
+    """Return the device if one is listed and only one sensor has no device; None otherwise."""
     listed = devices(answers, found, sensor)
     waiting = [name for name in sensors_of(answers) if not is_connected(answers, name)]
     return listed[0].address if len(listed) == 1 and len(waiting) == 1 else None
@@ -81,7 +81,11 @@ def unused_port(answers: Given, found: Found, _sensor: str) -> str:
 
 
 def baud(answers: Given, found: Found, sensor: str) -> int:
-    """Return the speed at which the device answered, or else the lowest sufficient usual speed."""
+    """Return the speed at which the device answered.
+
+    Otherwise, return the driver's default if it suffices, or else the first higher usual speed that
+    suffices.
+    """
     known = found.bauds.get(answers["device", sensor])
     if known is not None:
         return known

@@ -82,7 +82,7 @@ class MonitorState:
     reason: str = ""
     """Reason why the connection was lost."""
     rigs: dict[str, str] = field(default_factory=dict)
-    """Names of the rigs on the broker, by base topic; empty after one of them is chosen."""
+    """Names of the rigs that the last search found on the broker, by base topic."""
     rig: RigView = field(default_factory=RigView)
     view: ViewName = "live"
     choice: AngleChoice | None = None
@@ -98,7 +98,7 @@ class MonitorState:
     """Current calibration at the time when the list of stored versions was requested."""
     notice: RequestOutcome | None = None
     asked_to_stop: bool = False
-    """Whether the next press of the same key stops the recording."""
+    """Whether the next press of the key R stops the recording."""
 
     # --- connection ----------------------------------------------------------------------------
 
