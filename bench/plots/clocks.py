@@ -103,7 +103,7 @@ def _legend(figure: Figure, colors: dict[str, str], axis: Axes) -> None:
 
 
 def clocks(trace: Trace, about: SimulatedRun) -> Figure:
-    """Offset, skew, sigma, jitter, rate and gaps of every stream."""
+    """Draw offset, skew, sigma, jitter, rate and gaps of every stream."""
     labels = ("offset − first, ms", "skew, ppm", "sigma, µs", "jitter, ms", "rate, Hz", "gaps")
     figure = _figure("Clocks of all streams", labels, about, height=1.7)
     offset, skew, sigma, jitter, rate, gaps = figure.axes
@@ -161,7 +161,7 @@ def _rate_and_gaps(trace: Trace, name: str, color: str, rate: Axes, gaps: Axes) 
 
 
 def delays(trace: Trace, about: SimulatedRun) -> Figure:
-    """Arrival time minus stamp: the delay in excess of the minimum delay.
+    """Draw arrival time minus stamp, which is the delay in excess of the minimum delay.
 
     With echoes, it is the delay since the exposure.
     """
@@ -195,7 +195,7 @@ def delays(trace: Trace, about: SimulatedRun) -> Figure:
 
 
 def alignment(trace: Trace, about: SimulatedRun) -> Figure:
-    """Error of the stamps if the truth is known, and waiting time of the frames."""
+    """Draw the error of the stamps if the truth is known, and the waiting time of the frames."""
     errors = true_errors(trace, about.taken_ns, about.unseen_ns) if about.taken_ns else {}
     panels = [f"{name}: error, ms" for name in sorted(errors)]
     note = " (error less the smallest delay, which only the lag shows)" if errors else ""
@@ -238,7 +238,7 @@ def _latency(axis: Axes, trace: Trace) -> None:
 
 
 def lags(trace: Trace, about: SimulatedRun) -> Figure:
-    """Lag windows of every sensor with their sigmas; crosses are rejected windows."""
+    """Draw the lag windows of every sensor with their sigmas; crosses are rejected windows."""
     names = sorted(trace.lags)
     figure = _figure("IMU later than cameras, windows of 10 s, ± 2 sigma",
                      [f"{name}, ms" for name in names] or ["no optical bodies"], about)  # fmt: skip

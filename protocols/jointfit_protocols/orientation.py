@@ -81,7 +81,7 @@ class OrientationGate:
     ----------
     tolerance : float
         Largest deviation of the norm from 1. Use 0.01 for floats and fine integers, and 0.05 for
-        integers in thousandths. A constant small error is normal.
+        integers in thousandths. A small constant deviation of the norm is normal.
     """
 
     def __init__(self, tolerance: float = 0.01) -> None:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def recursive(_: Path) -> list[Result]:
-    """Least squares with 15 regressors, 3 targets, 500 samples, and forgetting factor 0.999."""
+    """Compare recursive and batch least squares: 15 regressors, 3 targets, forgetting 0.999."""
     rng = np.random.default_rng(15)
     n, p, forgetting, ridge = 500, 15, 0.999, 0.01
     g, noise = rng.normal(size=(n, p)), 0.1 * rng.normal(size=(n, 3))
@@ -44,7 +44,7 @@ def recursive(_: Path) -> list[Result]:
 
 
 def round_trip(_: Path) -> list[Result]:
-    """20 000 random rotations converted to angles and back by elementary rotations."""
+    """Convert 20 000 random rotations to angles, and back by elementary rotations."""
     q = rotation.normalize(np.random.default_rng(16).normal(size=(20_000, 4)))
     x, y, z = np.eye(3)
     alpha = patent_angles(q)

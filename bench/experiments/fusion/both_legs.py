@@ -56,7 +56,7 @@ def sit_to_stand(data: Path) -> list[Result]:
 
 
 def exchanged(data: Path) -> list[Result]:
-    """Errors of `sit_to_stand` with exchanged filter errors, RMS of five assignments.
+    """Measure the errors of `sit_to_stand` with exchanged filter errors, RMS of five assignments.
 
     The recordings assign one filter error to each sensor. This assignment is arbitrary.
     """
@@ -99,7 +99,7 @@ def left_out(data: Path) -> list[Result]:
 
 
 def coverage(data: Path) -> list[Result]:
-    """Coverage of flexion errors on both legs, for all movements.
+    """Measure the coverage of flexion errors on both legs, for all movements.
 
     The first part evaluates left-out movements. The second part evaluates the last 40 % of each
     movement after training on the first 60 % of all four.
@@ -125,7 +125,7 @@ def coverage(data: Path) -> list[Result]:
 
 
 def standing(data: Path) -> list[Result]:
-    """Errors in the static pose of the recorded subject, in natural stance.
+    """Measure the errors in the static pose of the recorded subject, in natural stance.
 
     In natural stance, the bones lean and the knees are slightly flexed. The sensor-to-segment
     alignments make the mean equal to the reference, so any correction is an error. The methods are

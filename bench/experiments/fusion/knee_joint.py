@@ -34,7 +34,7 @@ sensors of each segment."""
 
 
 def joint_itself(data: Path) -> list[Result]:
-    """RMS error of the joint rotation, from both segments and from a fit to the joint alone.
+    """Measure the RMS error of the joint rotation, from both segments and from a joint fit.
 
     The knee of the reference is a hinge, so adduction and rotation are functions of flexion. A fit
     to the joint learns these functions, which a real knee does not have.
@@ -63,7 +63,7 @@ def joint_itself(data: Path) -> list[Result]:
 
 
 def normalized_errors(data: Path) -> list[Result]:
-    """RMS ratio of error to predicted standard deviation, after training on three movements."""
+    """Measure the RMS ratio of error to predicted standard deviation, for three movements."""
     squats = Squats(data)
     walk, jump = load(data, "walking1"), load(data, "DJ1")
     models = fusion_methods.models([squats.training, walk, jump])

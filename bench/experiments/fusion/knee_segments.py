@@ -85,7 +85,7 @@ def _mean(trial: KneeTrial) -> tuple[Array, Array]:
 
 
 def baselines(data: Path) -> list[Result]:
-    """Errors of single sensors, of their mean, and of the regressions of the patent."""
+    """Measure the errors of single sensors, of their mean, and of the patent's regressions."""
     squats = Squats(data)
     said = {
         "single sensor (S2, S4)": (_single(1), (9.04, 9.00, 6.15)),
@@ -111,7 +111,7 @@ def _goals(errors: tuple[float, ...], goals: tuple[float, ...], label: str = "")
 
 
 def held_out(data: Path) -> list[Result]:
-    """Anchored correction on the last 40 % of the squats."""
+    """Measure the errors of the anchored correction on the last 40 % of the squats."""
     squats = Squats(data)
     models = KneeModels("anchored", [squats.training])
     return _goals(squats.judge.errors(models.predict(squats.held), squats.held), (1.4, 1.6, 1.2))
@@ -135,7 +135,7 @@ def three_movements(data: Path) -> list[Result]:
 
 
 def facing_elsewhere(data: Path) -> list[Result]:
-    """Largest change of an orientation if the subject faces another direction."""
+    """Measure the largest change of an orientation if the subject faces another direction."""
     squats = Squats(data)
     models = KneeModels("anchored", [squats.training])
     straight = models.predict(squats.held)
@@ -150,7 +150,7 @@ def facing_elsewhere(data: Path) -> list[Result]:
 
 
 def one_sensor(data: Path) -> list[Result]:
-    """Models for each single sensor, which apply if the other sensor is lost."""
+    """Measure the errors of the models for single sensors, which apply if the other one is lost."""
     squats = Squats(data)
     figures = []
     for index, goals in ((0, (1.5, 1.9)), (1, (2.1, 2.0))):

@@ -197,7 +197,7 @@ def squares(one: Person, calibration: Calibration, span: tuple[float, float]) ->
 
 
 def online(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Errors before and after online learning."""
+    """Measure the errors before and after online learning."""
     taken, people = 0, 0
     rows: dict[tuple[str, str], list[Array]] = {}
     worst = -np.inf
@@ -269,7 +269,7 @@ SPOILERS: dict[str, Callable[[OnlineFrames], OnlineFrames]] = {
 
 
 def guarded(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Number of accepted rounds with a wrong optical reference."""
+    """Count the accepted rounds with a wrong optical reference."""
     taken = dict.fromkeys(SPOILERS, 0)
     for seed in seeds:
         calibration = calibrated(seed)
@@ -290,7 +290,7 @@ def guarded(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
 
 
 def redonned(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Errors after re-donning of subjects with online learning, with a new static pose only."""
+    """Measure the errors after online learning and re-donning, with a new static pose only."""
     rows: dict[str, list[Array]] = {"as calibrated": [], "re-donned": []}
     for seed in seeds:
         calibration = calibrated(seed)

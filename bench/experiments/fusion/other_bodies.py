@@ -59,7 +59,7 @@ def drawn_body(seed: int) -> tuple[Knobs, LegGeometry]:
 
 
 def other_bodies(_: Path) -> list[Result]:
-    """Live errors of the default method and of the mean, and errors of the segment lengths."""
+    """Measure the live errors of the default method and the mean, and of the segment lengths."""
     rig = bench_rig()
     found: dict[Method, list[Errors]] = {method: [] for method in METHODS}
     off_mm = []

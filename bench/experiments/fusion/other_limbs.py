@@ -63,7 +63,7 @@ class _Live(NamedTuple):
 
 
 def spread(limb: str, _: Path) -> list[Result]:
-    """Median and worst RMS errors over the subjects, for angles and segments."""
+    """Return the median and worst RMS errors over the subjects, for angles and segments."""
     rig = bench_rig(limb=limb)
     subjects = [found for seed in SEEDS if (found := _live(limb, rig, seed)) is not None]
     figures = [

@@ -71,7 +71,7 @@ def squats_alone(trials: Trials) -> list[tuple[list[KneeTrial], Trials]]:
 
 
 def columns(data: Path, training: Training, deals: Sequence[int] = DEALS) -> list[Result]:
-    """Median error of the default method over `deals` in every column.
+    """Measure the median error of the default method over `deals` in every column.
 
     The threshold is the smallest median of the other methods plus `MARGIN_DEG`.
     """
@@ -90,7 +90,7 @@ def columns(data: Path, training: Training, deals: Sequence[int] = DEALS) -> lis
 
 
 def straight_knee(data: Path, deals: Sequence[int] = DEALS) -> list[Result]:
-    """Share of the squared error that is a rotation about the long axis with a straight knee.
+    """Measure the share of the squared error about the long axis with a straight knee.
 
     If thigh and shank are in line, both rotate about the same axis. The markers of pelvis and foot
     determine this rotation of the reference poorly, and the knee of its model couples both

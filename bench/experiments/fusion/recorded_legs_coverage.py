@@ -55,7 +55,7 @@ THREE_DEALS = (0, 3, 6)
 
 
 def coverage(data: Path, deals: Sequence[int] = THREE_DEALS) -> list[Result]:
-    """Median and smallest coverage over legs and deals, by movement."""
+    """Measure the median and smallest coverage over legs and deals, by movement."""
     results, shares = [], []
     for label, training in TRAININGS.items():
         for reference in REFERENCES:

@@ -105,7 +105,7 @@ def together(data: Path) -> list[Result]:
 
 
 def turned_and_donned(data: Path) -> list[Result]:
-    """A change of heading after calibration, and re-donned sensors with a new static pose."""
+    """Measure the effect of a changed heading, and of re-donned sensors with a new static pose."""
     training, held = _halves(data)
     judge = Judge.of(training)
     predict = fusion_methods.fit(DEFAULT, [training])
@@ -135,7 +135,7 @@ def turned_and_donned(data: Path) -> list[Result]:
 
 
 def coverage(data: Path) -> list[Result]:
-    """Coverage of errors in the training movement, in other movements, and in one of several.
+    """Measure the coverage in the training movement, in others, and in one of several.
 
     A few seconds of one movement contain few independent frames, so only the total has a threshold.
     """
@@ -170,7 +170,7 @@ def coverage(data: Path) -> list[Result]:
 
 
 def fit_time(data: Path) -> list[Result]:
-    """CPU time to fit both segments to 60 % of the squats."""
+    """Measure the CPU time to fit both segments to 60 % of the squats."""
     training = _halves(data)[0]
     took = []
     for _ in range(5):

@@ -219,7 +219,7 @@ def _row(method: Method) -> Callable[[Path], list[Result]]:
 
 
 def centers(_: Path) -> list[Result]:
-    """Distances of the joint centers from the ground truth in the static pose."""
+    """Measure the distances of the joint centers from the ground truth in the static pose."""
     errors = people()["anchored"]
     figures: list[Result] = []
     for joint in ("hip", "knee", "ankle"):

@@ -73,7 +73,7 @@ def _knee(columns: list[Array]) -> KneeTrial:
 
 
 def simulated(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Errors of all methods, and predicted errors of patent12, mean and the default method."""
+    """Measure the errors of all methods, and predicted errors of patent12, mean and the default."""
     people = [found for seed in seeds if (found := person(seed)) is not None]
     figures = [Result("subjects accepted", len(people), len(seeds), len(seeds) - 2, unit="")]
     errors = {

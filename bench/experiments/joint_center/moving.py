@@ -133,7 +133,7 @@ def followed(one: Wearer, moved_m: float) -> list[tuple[float, RunningCenter]]:
 
 
 def moving(tissue_mm: float, shifts_mm: tuple[float, ...], _: Path) -> list[Result]:
-    """False reports without a shift; reports and measured size for each shift."""
+    """Count false reports without a shift, and reports of each shift; measure each shift."""
     shares = []
     for seed in WEARERS:
         still = [center.moved for _, center in followed(wearer(seed, tissue_mm), 0.0)]

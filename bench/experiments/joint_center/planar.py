@@ -44,7 +44,7 @@ WIDE = CircleLimits(0.0, (0.0, np.inf), 0.0, np.inf)
 
 
 def three_frames(_: Path) -> list[Result]:
-    """Closed form compared with Cramer's rule; effect of a misprinted denominator at 1 m."""
+    """Compare the closed form with Cramer's rule, and with a misprinted denominator at 1 m."""
     rng = np.random.default_rng(1)
     p = rng.uniform(-1.0, 1.0, (30_000, 3, 2))
     u, v = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
@@ -71,7 +71,7 @@ def _as_printed(rng: np.random.Generator) -> float:
 
 
 def equal_steps(_: Path) -> list[Result]:
-    """Equation 15 compared with 200 000 runs."""
+    """Compare equation 15 with 200 000 runs."""
     figures = []
     for step in (45, 60, 90, 120, 150):
         rng = np.random.default_rng(step)
@@ -90,7 +90,7 @@ SIX_NOISES_M = 1e-3 * np.array([[0.3, 1.2], [0.8, 0.4], [1.5, 0.6]])
 
 
 def unequal_noise(_: Path) -> list[Result]:
-    """Mean squares along x and y, for six different standard deviations and for one per frame."""
+    """Compare mean squares along x and y for six standard deviations, and for one per frame."""
     t = np.array([0.3, 1.4, 2.9])
     drawn = np.random.default_rng(5).normal(size=(400_000, 3, 2))
     figures = []
@@ -105,7 +105,7 @@ def unequal_noise(_: Path) -> list[Result]:
 
 
 def forms(_: Path) -> list[Result]:
-    """Equation 14 from angles and from side lengths, compared with the Cramér-Rao bound."""
+    """Compare equation 14, from angles and from side lengths, with the Cramér-Rao bound."""
     rng = np.random.default_rng(3)
     t = np.sort(rng.uniform(0.0, 2.0 * np.pi, (500, 3)), axis=1)
     t = t[np.diff(t, axis=1).min(axis=1) > 0.2]
@@ -122,7 +122,7 @@ CASES = ((100, 90, 0.002), (100, 45, 0.005), (100, 20, 0.0005), (100, 20, 0.002)
 
 
 def plain_hyper(_: Path) -> list[Result]:
-    """The published Hyper fit and the Kåsa fit, relative to the bound."""
+    """Compare the published Hyper fit and the Kåsa fit with the bound."""
     figures = []
     for n, arc, noise in CASES:
         goal = 1.2 if (n, arc, noise) == (100, 20, 0.002) else 1.05
@@ -134,7 +134,7 @@ def plain_hyper(_: Path) -> list[Result]:
 
 
 def streaming(_: Path) -> list[Result]:
-    """Streaming fits with forgetting and with a window, compared with batch fits; their time."""
+    """Compare streaming fits, with forgetting or a window, with batch fits; measure their time."""
     rng = np.random.default_rng(5)
     n = 2000
     swing = 0.6 * np.sin(np.arange(n) * 0.05)
@@ -164,7 +164,7 @@ def streaming(_: Path) -> list[Result]:
 
 
 def claims(_: Path) -> list[Result]:
-    """Ratio of predicted to actual error, and share of short arcs whose estimate is accepted."""
+    """Measure the ratio of predicted to actual error, and the share of accepted short arcs."""
     figures = []
     for n, arc, noise in ((100, 22, 0.002), (100, 30, 0.002), *CASES[:3], CASES[4]):
         found = runs_on(n, arc, noise, runs=8000)
@@ -177,7 +177,7 @@ def claims(_: Path) -> list[Result]:
 
 
 def several(_: Path) -> list[Result]:
-    """Four markers at different angles about the joint, for an arc of 20°."""
+    """Measure the errors with four markers at different angles about the joint, arc of 20°."""
     rng = np.random.default_rng(7)
     t = np.linspace(-0.5, 0.5, 100) * np.deg2rad(20.0)
     offsets, radii = np.array([0.0, 0.25, -0.3, 0.6]), np.array([0.30, 0.35, 0.20, 0.28])
@@ -202,7 +202,7 @@ def _rms(centers: list[Array]) -> float:
 
 
 def at_the_bound(_: Path) -> list[Result]:
-    """Upper 95 % limit of the ratio of RMS error to bound, for 20 000 accepted estimates."""
+    """Measure the upper 95 % limit of RMS error over bound, for 20 000 accepted estimates."""
     figures = []
     for arc, goal in ((20, 1.15), (30, 1.15), (45, 1.03), (60, 1.03), (90, 1.03), (180, 1.03)):
         found = runs_on(100, arc, 0.002)
@@ -227,7 +227,7 @@ ELLIPSES: tuple[tuple[int, float, float, float], ...] = (
 
 
 def ellipses(_: Path) -> list[Result]:
-    """Share of accepted centers whose 95 % ellipse contains the truth; over 10 % are accepted."""
+    """Measure the share of accepted centers whose 95 % ellipse contains the true center."""
     figures = []
     for n, arc, noise, radius in ELLIPSES:
         found = runs_on(n, arc, noise, radius=radius, runs=10_000, correlated=True)
@@ -239,7 +239,7 @@ def ellipses(_: Path) -> list[Result]:
 
 
 def peers(_: Path) -> list[Result]:
-    """Accuracy and time of the packages circle-fit and SciPy in the same run, at 45° and 5 mm."""
+    """Compare accuracy and time with the packages circle-fit and SciPy, at 45° and 5 mm."""
     from circle_fit import hyperLSQ, hyperSVD, lm, taubinSVD  # noqa: PLC0415 - only here
     from scipy.optimize import least_squares  # noqa: PLC0415 - slow to import
 

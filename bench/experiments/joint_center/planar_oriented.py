@@ -81,7 +81,7 @@ def rms_errors(arc: float, kind: Kind, degrees: float, runs: int) -> tuple[float
 
 
 def table(_: Path) -> list[Result]:
-    """Ratio of the RMS error with angles to the RMS error of Hyper alone."""
+    """Measure the ratio of the RMS error with angles to the RMS error of Hyper alone."""
     figures = []
     for arc in ARCS:
         for kind, degrees in (*STATED, *BEYOND):
@@ -97,7 +97,7 @@ def table(_: Path) -> list[Result]:
 
 
 def short_arc(_: Path) -> list[Result]:
-    """Errors on an arc of 20° with slow errors of 1°, and in the worst cases of angle noise."""
+    """Measure errors on an arc of 20° with slow errors of 1°, and with the worst angle noise."""
     with_angles, without, refused = rms_errors(20, "slow", 1.0, 200)
     figures = [
         Result("arc of 20°, slow noise of 1°: with angles", 1000 * with_angles, 28.0, unit="mm"),

@@ -32,7 +32,7 @@ KNEE_FLOOR_MM = 50.0
 
 
 def compare(trial: str, data: Path) -> list[Result]:
-    """Distances from the model's centers, and predicted errors."""
+    """Measure the distances from the model's centers, and the predicted errors."""
     figures: list[Result] = []
     for found in judged(data, trial, METHODS):
         floor = KNEE_FLOOR_MM if "knee" in found.joint.name else inf

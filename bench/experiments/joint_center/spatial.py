@@ -63,7 +63,7 @@ def rms(errors: list[Array]) -> float:
 
 
 def four_markers(_: Path) -> list[Result]:
-    """Four markers about the joint with an arc of 20° and a noise of 2 mm, 400 runs."""
+    """Measure the errors with four markers, an arc of 20° and a noise of 2 mm, in 400 runs."""
     rng = np.random.default_rng(7)
     truth, noise = fan(20.0), 2e-3
     bound = np.sqrt(sphere_bound(truth, noise))
@@ -94,7 +94,7 @@ def upper_rms(errors: list[Array]) -> float:
 
 
 def frame_by_frame(_: Path) -> list[Result]:
-    """Streaming sphere fit compared with batch sums, with occluded markers."""
+    """Compare the streaming sphere fit with batch sums, with occluded markers."""
     rng = np.random.default_rng(5)
     points = carried(star_turns(45.0, 1000)) + rng.normal(0, NOISE, (1000, 4, 3))
     points[rng.uniform(size=points.shape[:2]) < 0.1] = np.nan
@@ -110,9 +110,10 @@ def frame_by_frame(_: Path) -> list[Result]:
 
 
 def ball_joint(rom: float, goals: tuple[float, ...], runs: int = 200) -> list[Result]:
-    """Two bodies with a noise of 1 mm on all markers; upper 95 % limits for 1000 or more runs.
+    """Compare five methods on two bodies with a noise of 1 mm on all markers.
 
-    Results of fewer than 200 runs vary by chance, and the tolerance allows for this variation.
+    Results of fewer than 200 runs vary by chance, and the tolerance allows for this variation. For
+    1000 or more runs, the results are upper 95 % confidence limits.
     """
     rng = np.random.default_rng(10)
     errors: dict[str, list[Array]] = {}
@@ -146,7 +147,7 @@ def _ball_joint(rom: float, goals: tuple[float, ...], runs: int, _: Path) -> lis
 
 
 def hinge_axis(_: Path) -> list[Result]:
-    """Axis of a hinge that rotates about z by 45°, 200 runs."""
+    """Measure the axis error of a hinge that rotates about z by 45°, in 200 runs."""
     rng = np.random.default_rng(11)
     markers = CHILD[:, [0, 2, 1]]
     off, angle, told = [], [], 0
@@ -166,7 +167,7 @@ def hinge_axis(_: Path) -> list[Result]:
 
 
 def parent_covariance(_: Path) -> list[Result]:
-    """Covariance of a point in a frame with noise, 20 000 frames."""
+    """Compare the predicted covariance of a point in a noisy frame with 20 000 frames."""
     rng = np.random.default_rng(12)
     point, noise = CHILD[1], 1e-3
     turns = np.tile(np.eye(3), (20_000, 1, 1))

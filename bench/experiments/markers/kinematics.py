@@ -35,7 +35,7 @@ _ROOT_SHIFT = [3, 4, 5]
 
 
 def slope(data: Path) -> list[Result]:
-    """Jacobian compared with central differences at 5 frames of walking."""
+    """Compare the Jacobian with central differences at 5 frames of walking."""
     model = oc4_lower(data)
     state = solve_frames(model, measured(data, "walking1", model)[::26]).state
     told, h, off = jacobian(model, state), 1e-6, 0.0
@@ -49,7 +49,7 @@ def slope(data: Path) -> list[Result]:
 
 
 def fit(data: Path) -> list[Result]:
-    """Tracking error of all frames without refinement."""
+    """Measure the tracking error of all frames without refinement."""
     model = oc4_lower(data)
     figures = []
     for trial, expected in EXPECTED_MM.items():
@@ -71,7 +71,7 @@ def turns_off_deg(model: ChainModel, a: ChainState, b: ChainState) -> Array:
 
 
 def occluded(data: Path) -> list[Result]:
-    """Occlusion of one marker per segment in half of all frames, and of 20 % of all markers."""
+    """Occlude one marker per segment in half of all frames, and then 20 % of all markers."""
     model, truth, clean = exact(data)
     rng = np.random.default_rng(0)
     y = clean.copy()
@@ -118,7 +118,7 @@ def live_us(model: ChainModel, y: Array) -> tuple[float, float]:
 
 
 def speed(data: Path) -> list[Result]:
-    """Speed with seven segments, 29 markers and 20 degrees of freedom, and with two segments."""
+    """Measure the time with seven segments (29 markers, 20 coordinates) and with two segments."""
     model = oc4_lower(data)
     y = measured(data, "walking1", model)
     small = two_segments()

@@ -44,7 +44,7 @@ def _less(before: float, after: float) -> float:
 
 
 def scaled_only(data: Path) -> list[Result]:
-    """Refined markers of the scaled model gait2354 in OpenSim's inverse kinematics."""
+    """Evaluate refined markers of the scaled model gait2354 in OpenSim's inverse kinematics."""
     subject = gait2354(data)
     chain, walk = subject.chain(), [subject.motion("walk1")]
     before = subject.verdicts(["walk1"])["walk1"].rms
@@ -66,7 +66,7 @@ def _off(found: Refinement, verdict: Verdict) -> float:
 
 
 def beside_opensim(data: Path) -> list[Result]:
-    """Simultaneous refinement compared with the published coordinate search through OpenSim."""
+    """Compare the simultaneous refinement with the published coordinate search through OpenSim."""
     subject = gait2354(data)
     chain, walk = subject.chain(), [subject.motion("walk1")]
     refine_markers(chain, walk, PLAIN)
@@ -117,7 +117,7 @@ def _untouched(data: Path) -> dict[str, Verdict]:
 
 
 def walking_alone(data: Path) -> list[Result]:
-    """Markers refined on walking alone, in OpenSim's inverse kinematics."""
+    """Evaluate markers refined on walking alone, in OpenSim's inverse kinematics."""
     subject = opencap(data)
     found = refine_markers(subject.chain(), [subject.motion("walking1")], PLAIN)
     after = subject.verdicts(EVERYTHING, found.model)
@@ -130,7 +130,7 @@ def walking_alone(data: Path) -> list[Result]:
 
 
 def _to_the_end(subject: OpensimSubject, found: Refinement) -> list[Result]:
-    """Errors of OpenSim for walking, with an accuracy that does not stop its tool early."""
+    """Return OpenSim's errors in walking, with an accuracy that does not stop its tool early."""
     walk = subject.judged["walking1"]
     before = judge(subject.model, walk, accuracy=CONVERGED).rms
     after = judge(subject.model, walk, found.model, CONVERGED).rms
@@ -151,7 +151,7 @@ def _to_the_end(subject: OpensimSubject, found: Refinement) -> list[Result]:
 
 
 def three_movements(data: Path) -> list[Result]:
-    """One marker set for three movements, which also determine the weighting of the trials."""
+    """Refine one marker set on three movements, which also determine the trial weights."""
     subject = opencap(data)
     evenness = chosen_evenness(subject, THREE)
     figures = [Result("evenness chosen by cross-validation", evenness, inf, unit="")]

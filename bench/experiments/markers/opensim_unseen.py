@@ -38,7 +38,7 @@ indicates a local minimum."""
 
 
 def every_movement(data: Path) -> list[Result]:
-    """Pelvis and legs: train on the static pose and three movements, evaluate on the fourth."""
+    """Train pelvis and legs on the static pose and three movements; evaluate on the fourth."""
     subject = opencap_legs(data)
     figures, errors, stuck = [], [], 0
     for name in EVERYTHING:

@@ -69,7 +69,7 @@ def walked(data: Path) -> tuple[Refinement, float]:
 
 
 def fast(data: Path) -> list[Result]:
-    """Simultaneous refinement on walking."""
+    """Refine markers and poses simultaneously on walking."""
     found, seconds = walked(data)
     return [
         Result("walking1", rms_mm(found, "walking1"), 4.85, unit="mm"),
@@ -79,7 +79,7 @@ def fast(data: Path) -> list[Result]:
 
 
 def same_minimum(data: Path) -> list[Result]:
-    """Simultaneous and block refinement reach the same minimum."""
+    """Check that simultaneous and block refinement reach the same minimum."""
     settings = RefinementSettings("block", huber_m=None, frames=_ALL, tolerance=1e-6)
     in_turns = refine_markers(oc4_lower(data), [motion(data, "walking1")], settings)
     off = abs(in_turns.costs[-1] / walked(data)[0].costs[-1] - 1.0)
@@ -89,7 +89,8 @@ def same_minimum(data: Path) -> list[Result]:
 
 
 def never_rises(data: Path) -> list[Result]:
-    """The objective never increases in 20 runs; each marker starts displaced by 15 mm per axis."""
+    """Check in 20 runs, from markers displaced by 15 mm per axis, that the objective never
+    rises."""
     model, trial = oc4_lower(data), motion(data, "walking1", 8)
     rises = steps = 0
     for seed in range(20):
@@ -116,7 +117,7 @@ def misplaced(data: Path) -> ChainModel:
 
 
 def beside_search(data: Path, every: int = 1) -> list[Result]:
-    """The published coordinate search and the simultaneous method from a displaced start."""
+    """Compare the published coordinate search with the simultaneous method, displaced start."""
     model, trials = misplaced(data), [motion(data, "walking1", every)]
     validation = [motion(data, "STS1")]
     began = time.process_time()
@@ -169,7 +170,7 @@ def unseen(data: Path) -> list[Result]:
 
 
 def invisible(data: Path) -> list[Result]:
-    """Directions that the tracking error does not determine."""
+    """Count the directions that the tracking error does not determine."""
     gauge = walked(data)[0].gauge
     return [
         Result("free directions", gauge.free, 7, 7, unit=""),
@@ -187,7 +188,7 @@ def _tissue(rng: np.random.Generator, clean: Array, rate: int) -> Array:
 
 
 def people(data: Path, count: int = 8) -> list[Result]:
-    """Simulated subjects at three speeds; the first speed is the training trial."""
+    """Refine the markers of simulated subjects at three speeds; the first speed is for training."""
     model = oc4_lower(data)
     held = {m.name: (True, True, True) for m in model.markers[:_PELVIS]}
     walk = solve_frames(model, measured(data, "walking1", model)).state
@@ -253,7 +254,7 @@ def _moved(data: Path) -> dict[str, ChainState]:
 
 
 def truth(data: Path, count: int = 8) -> list[Result]:
-    """Noise of 3 mm and displacements of 10 mm; anatomical markers are exact and locked."""
+    """Measure errors with noise of 3 mm and displacements of 10 mm; locked markers are exact."""
     model, truly = oc4_lower(data), _moved(data)
     off_mm, shares, errors = [], [], []
     for draw in _draws(model, truly, _ANATOMICAL, count):
@@ -273,7 +274,7 @@ def truth(data: Path, count: int = 8) -> list[Result]:
 
 
 def feet_let_go(data: Path, count: int = 32) -> list[Result]:
-    """Heels and toes are also displaced and free, so the foot's rotation is undetermined.
+    """Measure errors if heels and toes are also free, so that the foot's rotation is undetermined.
 
     The results include an ideal case. In this case, the markers are learned from noise-free
     movements, with a prior that only selects among equally good markers.

@@ -33,7 +33,7 @@ ROUNDING_DEG = 1e-6
 
 
 def raw_orientation(data: Path) -> list[Result]:
-    """Errors of orientations from bytes of gyroscope, accelerometer and magnetometer."""
+    """Measure errors of orientations from bytes of gyroscope, accelerometer and magnetometer."""
     figures = []
     for name in raw_imu_trials.TRIALS:
         trial = raw_imu_trials.load(data, name)
@@ -69,7 +69,7 @@ def _from_package(trial: raw_imu_trials.BoardTrial, said: Array | None, kind: st
 
 
 def begun_in_motion(data: Path) -> list[Result]:
-    """RMS error by second after the start of the filter, for twenty starts during fast motion."""
+    """Measure the RMS error by second after a filter start, for twenty starts in fast motion."""
     trial = raw_imu_trials.load(data, FAST)
     rng = np.random.default_rng(0)
     last = len(trial.moving) - 8 * SECOND

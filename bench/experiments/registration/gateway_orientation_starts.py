@@ -27,7 +27,7 @@ FIRST_MAX_DEG, LATER_MAX_DEG, GAP_MAX_DEG = 6.0, 4.0, 4.0
 
 
 def ten_starts(data: Path) -> list[Result]:
-    """Largest RMS error of three periods of one second, among ten starts in each trial.
+    """Measure the largest RMS error of three one-second periods, among ten starts per trial.
 
     The periods are the first second with output, the second around 10 s after the start, and the
     first second with output after a gap of 2 s. The settling time is the time from start or gap to

@@ -176,7 +176,7 @@ def orientation_error(
 
 
 def before_and_after(_: Path) -> list[Result]:
-    """Median and largest RMS errors of the sensors, and errors of the gyroscope scale."""
+    """Measure the median and largest RMS errors of the sensors, and gyroscope scale errors."""
     errors, scales = [], []
     for seed in range(SENSORS):
         rng = np.random.default_rng(seed)

@@ -35,7 +35,7 @@ def _rms(values: list[float]) -> float:
 
 
 def stillness(data: Path) -> list[Result]:
-    """Share of detected rest, and of motion detected as rest, in two whole trials of a board."""
+    """Measure the share of detected rest, and of motion detected as rest, in two board trials."""
     h5py = import_module("h5py")  # imported by this experiment only
     figures = []
     for name in TRIALS:
@@ -53,9 +53,9 @@ def stillness(data: Path) -> list[Result]:
 
 
 def static_mean(_: Path) -> list[Result]:
-    """Static mean with a scatter of 1 degree per axis; outliers are 30 to 90 degrees off.
+    """Measure the error of the static mean, with a scatter of 1 degree per axis and outliers.
 
-    A fifth of the frames are outliers.
+    A fifth of the frames are outliers, which differ by 30 to 90 degrees.
     """
     rng = np.random.default_rng(2)
     errors = []
@@ -91,7 +91,7 @@ def random_walk(
 
 
 def plate(_: Path) -> list[Result]:
-    """World and alignment from a plate, with and without 15 % random orientations, 10 runs each."""
+    """Measure world and alignment errors on a plate, with and without 15 % random orientations."""
     figures = []
     for share, label in ((0.0, "clean"), (0.15, "15 % outliers")):
         world, mount = [], []
@@ -108,7 +108,7 @@ def plate(_: Path) -> list[Result]:
 
 
 def one_axis(_: Path) -> list[Result]:
-    """Rotation about one axis only is rejected."""
+    """Check that a rotation about one axis only is rejected."""
     q_s, q_body, *_truth = random_walk(np.random.default_rng(4), axis=(1.0, 0.0, 0.0))
     found = fit_observable_alignment(q_s, q_body)
     kappa = fit_sensor_alignment("full", q_s, q_body).kappa
@@ -131,7 +131,7 @@ def _aligned(q_s: Array, q_opt: Array, kept: slice) -> list[Result]:
 
 
 def real_plate(data: Path) -> list[Result]:
-    """Recorded board with its orientation from a filter; 30 s of motion at 47.6 Hz."""
+    """Align a recorded board whose orientation is from a filter; 30 s of motion at 47.6 Hz."""
     h5py, vqf = import_module("h5py"), import_module("vqf")  # imported by this experiment only
     with h5py.File(data / "broad" / f"{TRIALS[0]}.hdf5") as trial:
         rate = float(trial.attrs["sampling_rate"])
@@ -143,7 +143,7 @@ def real_plate(data: Path) -> list[Result]:
 
 
 def integrated_plate(data: Path) -> list[Result]:
-    """Recorded board with its orientation from integrated rate; 30 s of motion after 5 s."""
+    """Align a recorded board whose orientation is the integrated rate; 30 s of motion after 5 s."""
     with np.load(data / "broad_excerpts" / f"{TRIALS[0]}_60s.npz", allow_pickle=False) as trial:
         rate = float(trial["sampling_rate"])
         gyr = trial["imu_gyr"].astype(np.float64)

@@ -124,17 +124,17 @@ def _found(
 
 
 def stuck(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Time until a stuck sensor is reported."""
+    """Measure the time until a stuck sensor is reported."""
     return _found(lambda p, name, t, _: faulty_wearer.stuck(p, name, t), "stuck", 0.5, seeds)
 
 
 def silent(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Time until a silent sensor is reported."""
+    """Measure the time until a silent sensor is reported."""
     return _found(lambda p, name, t, _: faulty_wearer.silent(p, name, t), "lost", 0.5, seeds)
 
 
 def slip(_: Path, degrees: float, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Time until a slip is reported."""
+    """Measure the time until a slip is reported."""
     angle = np.deg2rad(degrees)
     figures = _found(
         lambda p, name, t, dice: faulty_wearer.slipped(p, name, t, float(angle), dice),
@@ -149,7 +149,7 @@ def slip(_: Path, degrees: float, seeds: tuple[int, ...] = SEEDS) -> list[Result
 def false_alarms(
     _: Path, seeds: tuple[int, ...] = HEALTHY, hours: float = HOURS_EACH
 ) -> list[Result]:
-    """Number of fault events per hour for sensors without faults."""
+    """Count the fault events per hour for sensors without faults."""
     told, played = 0, 0.0
     part_s = 300.0
     for seed, calibration in calibrated_people(seeds):
@@ -170,7 +170,7 @@ def false_alarms(
 
 
 def real_skin(data: Path, trained: str, deals: Sequence[int] = DEALS) -> list[Result]:
-    """Share of recorded movements with a fault event although no sensor has a fault.
+    """Measure the share of recorded movements with a fault event although no sensor has a fault.
 
     The model is trained on one of the movements.
     """
@@ -203,7 +203,7 @@ def _offline(knee: KneeTrial, name: str) -> OfflineTrial:
 
 
 def drift(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Error of the knee rotation after 4 to 5 minutes of drift, without and with correction."""
+    """Measure the knee rotation error in the fifth minute of drift, corrected and uncorrected."""
     figures = []
     for rate in RATES:
         for names, who in ((("S3", "S4"), "shank"), (("S4",), "one sensor")):

@@ -143,7 +143,7 @@ def _rms(x: Array) -> float:
 def magnet(
     _: Path, groups: Sequence[tuple[str, ...]], seeds: tuple[int, ...] = PEOPLE
 ) -> list[Result]:
-    """Events about a disturbance, and errors of the output."""
+    """Measure delays of the events about a disturbance, and errors of the output."""
     found = [_pulled(*case) for case in _cases(seeds, groups)]
     delays = np.array([case.delay_s for case in found])
     segment, healthy, flexion = (

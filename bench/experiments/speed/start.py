@@ -66,7 +66,7 @@ def fit_rows(quick: bool) -> list[Result]:
 
 
 def exposure_rows(quick: bool) -> list[Result]:
-    """Exposure of the shipped systemd unit by systemd-analyze, from 0 (closed) to 10 (open)."""
+    """Return the exposure of the systemd units by systemd-analyze, from 0 (closed) to 10 (open)."""
     del quick
     tool = shutil.which("systemd-analyze")
     if tool is None:

@@ -102,7 +102,7 @@ def slerped_deg(period_ns: float, frames: Sequence[AlignedFrame], phase_ns: int)
 
 
 def interpolation(_data: Path) -> list[Result]:
-    """Interpolation of streams of 60, 100 and 120 Hz to frames at 100 Hz.
+    """Measure the interpolation error of streams of 60, 100 and 120 Hz at frames of 100 Hz.
 
     If the phase of a stream is fixed, the frames are midway between its samples.
     """
@@ -156,7 +156,7 @@ def _left_out_rms(truth: Sequence[Quaternion], rate_hz: float, step: int) -> flo
 
 
 def board(data: Path) -> list[Result]:
-    """Interpolation of every third or fifth sample of a recorded board.
+    """Measure the interpolation error with every third or fifth sample of a recorded board.
 
     The omitted samples are the ground truth.
     """
@@ -200,7 +200,7 @@ def _ahead_rms(
 
 
 def ahead(data: Path) -> list[Result]:
-    """Extrapolation with constant rate, with part of the acceleration (daemon), or all of it."""
+    """Compare extrapolation with no, a part (as in the daemon) or all of the acceleration."""
     figures = []
     for trial, name, scatter_deg, goal in (
         (FAST, "fast", 0.0, 0.45),
@@ -246,7 +246,7 @@ def four(mode: Mode, seed: int = 7) -> list[AlignedFrame]:
 
 
 def latency(_data: Path) -> list[Result]:
-    """Latency from the time of a frame to its completion, and error of its orientations."""
+    """Measure the latency from a frame's time to its completion, and its orientation errors."""
     figures = []
     goals: dict[Literal["smooth", "fast"], tuple[float, float, float]] = {
         "smooth": (10.5, 13.0, 0.006),
@@ -267,7 +267,8 @@ def latency(_data: Path) -> list[Result]:
 
 
 def honesty(_data: Path) -> list[Result]:
-    """Five clocks within 50 ppm; one sensor reboots, and another is silent for half a second."""
+    """Measure errors of flagged samples; one sensor reboots, another is silent for half a
+    second."""
     run = simulated(30.0)
     trace = traced(run.events)
     errors = true_errors(trace, run.taken_ns, run.unseen_ns)

@@ -93,7 +93,7 @@ def spread(values: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def echoes(_: Path, runs: int = 200) -> list[Result]:
-    """Echoes with round trips of 0.86 ms, exponential delays of 0.1 ms each way, and spikes.
+    """Measure errors with echoes of 0.86 ms, exponential delays of 0.1 ms each way, and spikes.
 
     1 % of the echoes have spikes of 20 ms.
     """
@@ -128,7 +128,7 @@ def passive(
 
 
 def jitter(_: Path, runs: int = 60) -> list[Result]:
-    """Passive clocks with usual jitter."""
+    """Measure the errors of passive clocks with usual jitter."""
     figures: list[Result] = []
     skews = np.zeros(0)
     for delays, seconds, goals in (
@@ -143,7 +143,7 @@ def jitter(_: Path, runs: int = 60) -> list[Result]:
 
 
 def timer(_: Path, runs: int = 90) -> list[Result]:
-    """Passive clocks with a badly configured latency timer."""
+    """Measure the errors of passive clocks with a badly configured latency timer."""
     ten, _skews, scaled = passive(latency_timer, 10.0, (0.11, 0.25), runs)
     sixty, _skews, _scaled = passive(latency_timer, 60.0, (0.015, 0.05), runs // 3)
     honest = Result("error over standard deviation, RMS", spread(scaled)[0], 1.5, 0.3, unit="")
@@ -151,7 +151,7 @@ def timer(_: Path, runs: int = 90) -> list[Result]:
 
 
 def wraps_and_restarts(_: Path) -> list[Result]:
-    """Overflow of every clock type, then a reboot."""
+    """Measure the errors at an overflow of every clock type, and after a reboot."""
     worst, settle, early = 0.0, 0.0, 0
     for tick_ns, modulus in ((1000, 1 << 32), (100_000, 1 << 32), (100_000, 864_000_000)):
         for seed in range(3):
@@ -188,7 +188,7 @@ def _wrapped(seed: int, clock: TickClock) -> tuple[float, float, int]:
 
 
 def cost(_: Path) -> list[Result]:
-    """Time per sample including refits, best of five runs of one minute."""
+    """Measure the time per sample including refits, best of five runs of one minute."""
     rng = np.random.default_rng(0)
     n = 6000
     best = float("inf")

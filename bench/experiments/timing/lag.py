@@ -164,7 +164,7 @@ def excerpts(
 
 
 def honest(data: Path) -> list[Result]:
-    """No accepted window has an error above four standard deviations, for any disturbance."""
+    """Check, for each disturbance, that no accepted error exceeds four standard deviations."""
     treatments = {
         "as recorded": AS_IT_IS,
         "0.3 deg optical noise": Treatment(noise_deg=0.3),
@@ -189,7 +189,7 @@ def honest(data: Path) -> list[Result]:
 
 
 def quaternion_input(data: Path) -> list[Result]:
-    """Orientations integrated from the angular rate lead the rate by half a sample.
+    """Check that orientations integrated from the angular rate lead the rate by half a sample.
 
     The lead is the same if the orientations are rounded.
     """
@@ -254,7 +254,7 @@ def estimate_between(
 
 
 def sigma(_: Path) -> list[Result]:
-    """Ratios of error to sigma in 32 independent windows, at five levels of optical noise.
+    """Measure ratios of error to sigma in 32 independent windows, at five levels of optical noise.
 
     The simulated stamps are exact.
     """
@@ -286,7 +286,7 @@ def track(drift: float, seed: int) -> tuple[float, float]:
 
 
 def drift(_: Path) -> list[Result]:
-    """Over two minutes zero drift is reported as zero, and 1 ppm is detected."""
+    """Check that over two minutes zero drift is reported as zero, and 1 ppm is detected."""
     figures = []
     for truth, seed in ((0.0, 1), (0.0, 2), (1.0, 3), (-1.0, 4)):
         found, sd = track(truth * 1e-6, seed)
@@ -304,7 +304,7 @@ def drift(_: Path) -> list[Result]:
 
 
 def cost(data: Path) -> list[Result]:
-    """Cost of a window of 10 s (120 and 286 Hz, median of nine), and of a tracker update.
+    """Measure the cost of a window of 10 s (120 and 286 Hz, median of nine) and of an update.
 
     The cost is the CPU time of this thread, so other processes do not affect it.
     """
@@ -332,7 +332,7 @@ def cost(data: Path) -> list[Result]:
 
 
 def ordinary(data: Path) -> list[Result]:
-    """Accuracy of ten seconds of vigorous motion, of ordinary motion, and of rest."""
+    """Measure the accuracy of ten seconds of vigorous motion, of ordinary motion, and of rest."""
     figures = []
     for name, label, goal in ((FAST, "vigorous", 0.02), (SLOW, "ordinary", 0.14)):
         recording = excerpt(data, name)

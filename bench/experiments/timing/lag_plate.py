@@ -24,7 +24,7 @@ FREE = float("inf")
 
 
 def on_the_plate(_: Path) -> list[Result]:
-    """Errors of the lags of all sensors, in ms and in predicted standard deviations."""
+    """Measure the lag errors of all sensors, in ms and in predicted standard deviations."""
     settings = bench_rig().calibration
     lags, sigmas, refused = [], [], 0
     for seed in SEEDS:

@@ -122,7 +122,7 @@ def run(case: Case, seconds: float = 121.0, seed: int = 1) -> Found:
 
 
 def drifting(_: Path) -> list[Result]:
-    """Clocks that differ by 100 ppm leave no drift.
+    """Check that clocks that differ by 100 ppm leave no drift.
 
     A drift outside the clock model is detected and reported.
     """

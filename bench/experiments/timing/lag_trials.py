@@ -32,7 +32,7 @@ SAWTOOTH_HZ = np.arange(0.3, 1.0, 0.002)
 
 
 def all_trials(data: Path) -> list[Result]:
-    """Largest ratio of error to standard deviation, for each trial and window length."""
+    """Measure the largest ratio of error to standard deviation, by trial and window length."""
     figures = []
     for path in sorted((data / "broad").glob("*.hdf5")):
         recording = whole(data, path.stem)

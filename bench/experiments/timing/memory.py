@@ -185,7 +185,7 @@ def growth(looks: list[Held]) -> float:
 
 
 def flat(_data: Path) -> list[Result]:
-    """Ten hours, measured four times an hour."""
+    """Measure the memory over ten hours, four times an hour."""
     looks, samples, states = watch(10.0, 4)
     sizes = [look.size for look in looks if look.hours > SETTLE_H]
     return [
