@@ -40,12 +40,13 @@ class SerialImuSettings(ImuSettings):
 
     port: str = Field(description="serial port, preferably a link under /dev/serial/by-id")
     baud: int = Field(
-        115_200, ge=SLOWEST_BAUD, le=FASTEST_BAUD, description="speed the device runs at, baud"
+        115_200, ge=SLOWEST_BAUD, le=FASTEST_BAUD, description="line speed of the device, baud"
     )
     transport: Literal["uart", "usb"] = Field(
         "uart",
         description="`uart`: a line at `baud`, also behind a USB bridge; stamps are back-dated by "
-        "the bytes that came. `usb`: the device's own USB port, where bytes take no time",
+        "the duration of the received bytes. `usb`: the device's own USB port, where bytes have "
+        "no duration",
     )
 
     @property

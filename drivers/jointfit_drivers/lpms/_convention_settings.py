@@ -14,14 +14,17 @@ class LpmsConventionSettings(Settings):
 
     direction: Literal["world_to_sensor", "sensor_to_world"] = Field(
         "world_to_sensor",
-        description="whether its quaternions map world to sensor coordinates, or the reverse; both "
-        "ROS drivers of the vendor invert them, and [a turn by "
+        description="whether its quaternions map world to sensor coordinates, or the reverse; "
+        "both ROS drivers of the vendor invert them, and [a turn by "
         "hand](devices/lpms.md#convention) shows which applies",
     )
     world: Literal["NWU", "ENU", "NED"] = Field(
         "NWU",
-        description="axes of its world: x to magnetic north, y west, z up by the vendor's manual",
+        description="axes of the sensor's world; the vendor's manual states x to magnetic north, "
+        "y west, z up",
     )
     scale: Literal["auto", 10_000, 1_000, 32_767] = Field(
-        "auto", description="counts of 1.0 in 16-bit data; auto: from the norm of the quaternions"
+        "auto",
+        description="number of counts for 1.0 in 16-bit data; auto: determined from the norm of "
+        "the quaternions",
     )

@@ -46,7 +46,7 @@ class SerialFieldSettings(FieldSettings):
     """One quantity of a frame or line, or some of its components."""
 
     column: int | None = Field(
-        None, ge=1, le=_MOST_COLUMNS, description="of text lines: first column, from 1"
+        None, ge=1, le=_MOST_COLUMNS, description="for text lines: first column, from 1"
     )
 
 
@@ -62,13 +62,17 @@ class SerialFields(Settings):
     magnetic: Parts = Field((), description="magnetic field, sensor axes, any unit")
     time: Parts = Field((), description="device time of the measurement")
     counter: Parts = Field((), description="number of the sample")
-    valid: Parts = Field((), description="status bits; samples without them are dropped")
+    valid: Parts = Field(
+        (), description="status bits; samples that they mark as invalid are dropped"
+    )
 
 
 class NumberSettings(Settings):
     """An integer of the frame."""
 
-    offset: int = Field(ge=0, lt=LONGEST_FRAME, description="its first byte in the frame, from 0")
+    offset: int = Field(
+        ge=0, lt=LONGEST_FRAME, description="first byte of the number in the frame, from 0"
+    )
     type: str = Field("u8", description="u8, u16 or another integer", examples=["u16"])
     byte_order: Literal["little", "big"] | None = Field(
         None, description="default: `byte_order` of the table"
@@ -94,7 +98,9 @@ class LengthSettings(NumberSettings):
 class MessageSettings(NumberSettings):
     """The type of the frame, in the frame."""
 
-    equals: int = Field(description="its value in frames with measurements; others are skipped")
+    equals: int = Field(
+        description="value of the type in frames with measurements; other frames are skipped"
+    )
 
 
 class FrameSettings(Settings):
@@ -105,7 +111,7 @@ class FrameSettings(Settings):
         None, ge=2, le=LONGEST_FRAME, description="size of every frame, bytes"
     )
     length_field: LengthSettings | None = Field(
-        None, description="length in the frame, instead of `length`"
+        None, description="field of the frame that contains its length, instead of `length`"
     )
     checksum: ChecksumSettings | None = Field(
         None, description="checksum behind the fields; default: none"
@@ -135,7 +141,9 @@ class FrameSettings(Settings):
 class TextSettings(Settings):
     """Text lines: one sample per line."""
 
-    separator: str = Field(",", max_length=4, description='between columns; "" for blanks and tabs')
+    separator: str = Field(
+        ",", max_length=4, description='separator of columns; "" for blanks and tabs'
+    )
     prefix: str = Field("", description="first characters of every line with measurements")
     columns: int | None = Field(
         None, ge=1, le=_MOST_COLUMNS, description="number of columns; default: not checked"

@@ -24,15 +24,15 @@ class FieldSettings(Settings):
     )
     offset: Annotated[int, Field(ge=0, le=_MOST_BYTES)] | tuple[int, ...] | None = Field(
         None,
-        description="first byte in the frame, from 0; components follow each other, or a list "
-        "with the byte of each",
+        description="first byte in the frame, from 0, of components that follow each other; or a "
+        "list with the first byte of each component",
     )
     bit: int = Field(
         0,
         ge=0,
         le=63,
-        description="first bit after `offset`: from the least significant one if little-endian, "
-        "from the most significant one if big-endian",
+        description="first bit after `offset`: counted from the least significant bit if "
+        "little-endian, from the most significant bit if big-endian",
     )
     type: str | None = Field(
         None,
@@ -49,18 +49,18 @@ class FieldSettings(Settings):
     zero: float = Field(0.0, description="value of the count 0, in `unit`")
     unit: str | None = Field(
         None,
-        description="of rate: rad/s, deg/s, mdeg/s, mrad/s; of acceleration: m/s2, g, mg; of "
+        description="for rate: rad/s, deg/s, mdeg/s, mrad/s; for acceleration: m/s2, g, mg; for "
         "time: s, ms, 100us, us, ns",
     )
     modulus: int | None = Field(
         None,
         gt=1,
-        description="of time and counter: number of values before they begin at 0 again; default: "
-        "all values of the type",
+        description="for time and counter: number of values before they begin at 0 again; "
+        "default: all values of the type",
     )
-    mask: int | None = Field(None, gt=0, description="of valid: bits that are evaluated")
+    mask: int | None = Field(None, gt=0, description="for valid: bits that are evaluated")
     equals: int | None = Field(
-        None, description="of valid: value of these bits in a valid sample; default: any but 0"
+        None, description="for valid: value of these bits in a valid sample; default: any but 0"
     )
 
 
@@ -91,19 +91,22 @@ class ChecksumSettings(Settings):
     first: int = Field(
         0,
         ge=0,
-        description="first byte of the frame that it includes; the last is the byte before it",
+        description="first included byte of the frame; the last one is the byte before the "
+        "checksum",
     )
     byte_order: Literal["little", "big"] | None = Field(
         None,
-        description="default: `byte_order` of the table; of fletcher16, little: plain sum first",
+        description="default: `byte_order` of the table; for fletcher16, little: plain sum first",
     )
     polynomial: int | None = Field(
-        None, gt=0, description="of a CRC, not reflected; default: 0x07, 0x1021 or 0x04C11DB7"
+        None,
+        gt=0,
+        description="polynomial of a CRC, not reflected; default: 0x07, 0x1021 or 0x04C11DB7",
     )
     init: int = Field(0, ge=0, description="initial value")
-    reflected: bool = Field(False, description="of a CRC: least significant bit first")
-    xor_out: int = Field(0, ge=0, description="XOR of the result")
-    modulus: Literal[255, 256] = Field(256, description="of fletcher16")
+    reflected: bool = Field(False, description="for a CRC: process the least significant bit first")
+    xor_out: int = Field(0, ge=0, description="value that is combined with the result by XOR")
+    modulus: Literal[255, 256] = Field(256, description="modulus of fletcher16")
 
     def checksum(self, byte_order: Literal["little", "big"]) -> Checksum:
         """Return the parameters of the checksum; `byte_order` is the default of its byte order."""
@@ -126,12 +129,12 @@ class TableImuSettings(GatewaySettings):
     """Common keys of all devices that a table describes."""
 
     byte_order: Literal["little", "big"] = Field(
-        "little", description="byte order of fields that name none"
+        "little", description="byte order of fields without a `byte_order` of their own"
     )
     world: Literal["ENU", "NED", "NWU"] = Field(
         "ENU",
-        description="directions of the x, y and z axis of its world: E east, N north, W west, U "
-        "up, D down",
+        description="directions of the x, y and z axis of the device's world: E east, N north, W "
+        "west, U up, D down",
     )
     direction: Literal["sensor_to_world", "world_to_sensor"] = Field(
         "sensor_to_world",

@@ -101,7 +101,7 @@ def place_fields(
             for letter, each in zip(order, placed, strict=True):
                 slot = SLOTS[name][letters.index(letter)]
                 if slot in form.fields:
-                    form.faults.append((f"{key}.order", f"component {letter} has a place already"))
+                    form.faults.append((f"{key}.order", f"component {letter} occurs twice"))
                 form.fields[slot], form.parts[slot] = each, part
         missing = [
             x for x, slot in zip(letters, SLOTS[name], strict=True) if slot not in form.fields

@@ -24,18 +24,18 @@ class XbusSettings(GatewaySettings, SerialImuSettings):
 
     persist: bool = Field(
         False,
-        description="write a differing output configuration into the device; every write is "
-        "stored in its flash at once",
+        description="write the output configuration into the device if it differs; the device "
+        "stores every write in its flash at once",
     )
     world: Literal["ENU", "NED", "NWU"] = Field(
         "ENU",
-        description="world that `persist` writes into the device; every message names its own, "
-        "so any is decoded",
+        description="world that `persist` writes into the device; every message names its world, "
+        "so the driver decodes all worlds",
     )
     sync: tuple[XbusSyncSettings, ...] | None = Field(
         None,
-        description="functions of all its sync lines; written only where they differ and "
-        "`persist` allows it. Default: unchanged",
+        description="functions of all sync lines of the device; written only if they differ and "
+        "`persist` permits it. Default: unchanged",
     )
     reset_if_stuck: bool = Field(
         False, description="reset a device that streams but does not answer; its clock restarts"
@@ -45,27 +45,31 @@ class XbusSettings(GatewaySettings, SerialImuSettings):
         None,
         ge=0,
         le=0xFF,
-        description="device whose measurements are used, on a line with several (Xbus master); "
-        "default: the first that sends",
+        description="bus id of the device whose measurements are used, on a line with several "
+        "devices (Xbus master); default: the first device that sends",
     )
     format: Literal["mtdata2", "mtdata"] = Field(
         "mtdata2",
-        description="message of the measurements: `mtdata2`, or `mtdata` of older devices, whose"
-        " configuration is read and never written",
+        description="message of the measurements: `mtdata2`, or `mtdata` of older devices, whose "
+        "configuration is read and never written",
     )
     output_mode: int | None = Field(
         None,
         ge=0,
         le=0xFFFF,
-        description="fields of MTData; default: as the device reports, which a capture may lack",
+        description="fields of MTData messages; default: as the device reports them. Set it for a "
+        "capture without this report",
     )
     output_settings: int | None = Field(
-        None, ge=0, le=0xFFFF_FFFF, description="format of MTData; default: as the device reports"
+        None,
+        ge=0,
+        le=0xFFFF_FFFF,
+        description="format of MTData messages; default: as the device reports",
     )
     legacy_world: Literal["NWU", "ENU"] = Field(
         "NWU",
-        description="world of MTData unless its settings say NED: `NWU` is that of MTi and MTx of "
-        "the first generations, `ENU` that of later devices",
+        description="world of MTData messages, unless the output settings select NED: `NWU` for "
+        "MTi and MTx of the first generations, `ENU` for later devices",
     )
 
     @override

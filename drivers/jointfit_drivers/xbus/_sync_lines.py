@@ -47,22 +47,29 @@ class XbusSyncSettings(Settings):
 
     function: Function = Field(
         description="`trigger_indication` (reports edges), `clock_bias_estimation` (edges every "
-        "`period_ms` discipline its clock), `start_sampling`, `send_latest`, `gnss_1pps`; on an "
-        "output `interval_transition_measurement` (a pulse a sample)"
+        "`period_ms` synchronize the device clock), `start_sampling`, `send_latest`, `gnss_1pps`; "
+        "on an output `interval_transition_measurement` (one pulse per sample)"
     )
     line: Literal["clock_in", "in1", "in2", "out1"] = Field(description="line of the device")
-    polarity: Literal["rising", "falling", "both"] = Field("rising", description="edge that counts")
-    once: bool = Field(False, description="only the first edge")
-    skip_first: int = Field(0, ge=0, le=_MOST, description="edges ignored at first")
-    skip_factor: int = Field(0, ge=0, le=_MOST, description="edges ignored between two that count")
+    polarity: Literal["rising", "falling", "both"] = Field(
+        "rising", description="edge that is used"
+    )
+    once: bool = Field(False, description="use only the first edge")
+    skip_first: int = Field(0, ge=0, le=_MOST, description="number of edges ignored at the start")
+    skip_factor: int = Field(
+        0, ge=0, le=_MOST, description="number of edges ignored between two used edges"
+    )
     pulse_width_ms: float = Field(
-        0.0, ge=0, le=6553.5, description="of the pulses of an output, ms, in steps of 0.1"
+        0.0, ge=0, le=6553.5, description="width of the pulses on an output, ms, in steps of 0.1"
     )
     delay_ms: float = Field(
-        0.0, ge=0, le=6553.5, description="from edge to action, ms, in steps of 0.1"
+        0.0, ge=0, le=6553.5, description="delay from the edge to the action, ms, in steps of 0.1"
     )
     period_ms: int = Field(
-        0, ge=0, le=_MOST, description="of the reference of `clock_bias_estimation`, ms"
+        0,
+        ge=0,
+        le=_MOST,
+        description="period of the reference edges of `clock_bias_estimation`, ms",
     )
     wire: int = Field(
         0,
