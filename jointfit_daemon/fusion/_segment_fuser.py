@@ -152,8 +152,8 @@ class SegmentFuser:
         t_ns : int
             Instant of the frame.
         inputs : dict
-            Orientation q_optical_segment computed from each sensor of the limb that has data. The
-            segment is the one to which the sensor is attached.
+            Orientation q_optical_segment computed from each sensor of the limb that has data. It is
+            the orientation of the segment to which the sensor is attached.
         neighbor : sequence of str
             Sensors of the neighboring segment, whose posture is an input of the models; must not
             change between calls.

@@ -162,7 +162,7 @@ def soft_tissue_variance(
 ) -> float:
     r"""Return the variance of the soft-tissue artefact, m².
 
-    The caller multiplies it by the inverse of the information.
+    The caller multiplies this variance by the inverse of the information matrix.
 
     .. math:: \mathrm{Cov}_{posture} = p^2 \left[ \overline{u u^T} - \bar u \bar u^T \right]^{-1}
 

@@ -35,7 +35,10 @@ BIAS_S = 15.0
 START_SD = radians(1.0)
 """Standard deviation of the headings just after a static pose, rad."""
 OUTLIER_SIGMA = 5.0
-"""Largest accepted innovation, in standard deviations. Slips and restarts cause larger ones."""
+"""Largest accepted innovation, in standard deviations.
+
+Slips and restarts cause larger innovations.
+"""
 
 
 class HeadingDriftFilter:

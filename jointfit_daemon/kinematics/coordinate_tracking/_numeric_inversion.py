@@ -179,7 +179,7 @@ def _take_step(
     to_R = np.concatenate((A[None], R[1 + count :]))
     between = R[: 1 + count].swapaxes(-1, -2) @ to_R
 
-    # The sine replaces the rotation angle, which is accurate for the small rotations of the last
+    # The sine replaces the rotation angle. This is accurate for the small rotations of the last
     # steps.
     steps = np.zeros((1 + count, 6))
     steps[:, :3] = 0.5 * (between[:, (2, 0, 1), (1, 2, 0)] - between[:, (1, 2, 0), (2, 0, 1)])

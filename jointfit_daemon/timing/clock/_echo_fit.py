@@ -8,7 +8,7 @@ keeps s small in the first seconds. The error of theta_0 is half the difference 
 of request and reply; ``bound_ns`` is the limit of this error.
 
 Invariant: a single wrong or forged echo does not change a settled fit. An echo that contradicts the
-fit is not used. If the next echo agrees with it, the server clock was restarted.
+fit is not used. If the next echo agrees with this echo, the server clock was restarted.
 """
 
 from __future__ import annotations
