@@ -77,8 +77,8 @@ class CanReception:
         needed : CanKey
             Identifier of the frames with measurements; one of `ids`.
         resembles : callable
-            Function that returns whether the data of a frame resemble those of `needed`. It is used
-            for a hint in the error message.
+            Function that returns whether the data of a frame resemble the data of `needed` frames.
+            The result is used for a hint in the error message.
         """
         settings = self._settings
         left = _RAW_FRAMES if log.isEnabledFor(logging.DEBUG) else 0

@@ -1,7 +1,7 @@
 """Checks of every IMU sample: norm and sign of the quaternion, device time and message counter.
 
-The decoders of all IMUs use these checks. Lost messages, restarts, a wrong scale and a rate other
-than the configured rate become device events.
+The base classes `SerialDecoder` and `CanDecoder` use these checks. Lost messages, restarts, a wrong
+scale, and a rate that differs from the configured rate are reported as device events.
 
 Invariant: the output depends only on the samples added. The module reads no clock and no port.
 """

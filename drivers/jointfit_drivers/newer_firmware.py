@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Decoded
 
 _SIGHTINGS = 10
-"""Number of unknown contents of one kind that causes a warning. Fewer prove nothing, because a weak
-checksum accepts some corrupt messages."""
+"""Number of unknown contents of one kind that causes a warning. A smaller number proves nothing,
+because a weak checksum accepts some corrupt messages."""
 _WITHIN_NS = 60_000_000_000
 """Longest time between the first and the last of these contents for a warning, ns."""
 _MOST_KINDS = 16

@@ -24,8 +24,8 @@ log = logging.getLogger(__name__)
 _QUIET_S = 0.1
 """Pause after which the rest of a message with a corrupt length is no longer expected, s."""
 _KEPT = 8192
-"""Number of bytes stored before the first reply. It exceeds one message and the data that
-follow."""
+"""Number of bytes stored before the first reply. This number exceeds the size of one message and of
+the data that follow it."""
 _LOGGED = 20
 """Number of chunks logged at debug level, so that the log contains raw data of a new device."""
 

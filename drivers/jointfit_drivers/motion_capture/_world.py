@@ -123,6 +123,6 @@ _WORLDS: dict[str, tuple[Place, Turn]] = {
     ),
     "-z": (lambda x, y, z: (x, -y, -z), lambda w, x, y, z: (-x, w, -z, y)),
 }
-"""Rotation of the world that makes z up, for each up axis: 90° about y or x, or 180° about x. It is
-applied to positions, and multiplied from the left to quaternions.
+"""Rotation of the world that makes z up, for each up axis: 90° about y or x, or 180° about x. The
+rotation is applied to positions, and multiplied from the left to quaternions.
 """

@@ -9,7 +9,7 @@
 
 Every accepted datagram is emitted in the order of arrival, so that a replay has the same input. The
 receiver of the chunks decodes the frames. This module reads only their flags. Once per second it
-also decodes one frame, to check that this is possible and that the ids are known.
+also decodes one frame, to check that frames can be decoded and that their ids are known.
 
 Invariant: control messages are accepted only as answers to open requests (`OpenRequests`). If the
 frames of a server cannot be decoded, the server counts as lost, as if it sent nothing.

@@ -183,8 +183,8 @@ class SharedBus:
         first_s : float, optional
             Longest wait for the first of these frames, s. The default is `silence_s`.
         resembles : callable
-            Function that returns whether the data of a frame resemble those of `needed`. It is used
-            for a hint in the error message.
+            Function that returns whether the data of a frame resemble the data of `needed` frames.
+            The result is used for a hint in the error message.
         worked : bool
             Whether the device has sent measurements before, which means that its settings are
             correct.

@@ -2,9 +2,9 @@
 
 1. QTM sends a greeting. The session then sends ``Version`` for each version from 1.25 down to 1.19,
    until QTM accepts one.
-2. It sends ``GetState``, and ``GetParameters`` every second until QTM has parameters.
-3. It sends ``StreamFrames``, which has no answer. Frames follow, or "no more data" while QTM waits
-   for a measurement.
+2. The session sends ``GetState``, and then ``GetParameters`` every second until QTM has parameters.
+3. The session sends ``StreamFrames``, which has no answer. Frames follow, or "no more data" while
+   QTM waits for a measurement.
 
 Every packet is emitted in the order of arrival, so that a replay has the same input. The receiver
 of the chunks decodes the frames. Once per second this module decodes one frame, to check that it

@@ -1,4 +1,4 @@
-"""Driver for the Vicon programs Nexus, Tracker, Shogun and Evoke, by their protocol DataStream."""
+"""Driver for the Vicon programs Nexus, Tracker, Shogun, Evoke and Blade, by the DataStream."""
 
 from jointfit_drivers.vicon._decoder import ViconDecoder
 from jointfit_drivers.vicon._driver import ViconMocap

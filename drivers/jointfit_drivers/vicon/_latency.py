@@ -1,4 +1,4 @@
-"""Delay from exposure to arrival, as far as the server announces it.
+"""Delay from exposure to arrival, as far as the server announces this delay.
 
 The server sends neither the time of exposure nor a clock. LatencyInfo contains the durations of the
 processing stages, and a ping limits the delay of the network.

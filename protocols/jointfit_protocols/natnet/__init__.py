@@ -1,4 +1,4 @@
-"""Wire format NatNet 3 and 4 of OptiTrack over UDP: messages, frames and model definitions."""
+"""Wire format NatNet 2.5 to 4.x of OptiTrack over UDP: messages, frames and model definitions."""
 
 from jointfit_protocols.natnet._connect import Connect
 from jointfit_protocols.natnet._frame import (

@@ -1,4 +1,4 @@
-"""Wire format Xbus of Xsens over UART or USB: framing, device configuration and MTData2 items."""
+"""Wire format Xbus of Xsens over UART or USB: framing, configuration, MTData and MTData2."""
 
 from jointfit_protocols.xbus._framing import (
     MASTER,
