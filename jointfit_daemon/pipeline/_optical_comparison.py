@@ -122,7 +122,10 @@ class OpticalComparison:
         return done
 
     def _states_around(self, t_ns: int) -> tuple[LimbState, LimbState] | None:
-        """Return the limb states before and after an instant; None if they are too far apart."""
+        """Return the limb states before and after an instant.
+
+        The result is None if the states are too far apart or not synchronized.
+        """
         after = None
         for state in reversed(self._states):
             if state.t_ns <= t_ns:
@@ -183,7 +186,10 @@ class OpticalComparison:
 
 
 def _segments_at(t_ns: int, before: LimbState, after: LimbState) -> list[Quaternion | None]:
-    """Return the segments interpolated between two states; None without sensor data in either."""
+    """Return the segments interpolated between two states.
+
+    A segment is None if one of the states lacks data from its sensors.
+    """
     share = _share(t_ns, before, after)
     return [
         interpolate_one(a.q_world_segment, b.q_world_segment, share)

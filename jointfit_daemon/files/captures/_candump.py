@@ -84,7 +84,7 @@ def pack_can_frame(
 
 
 def frame_sizes(records: bytes) -> dict[tuple[int, bool], int]:
-    """Return the number of data bytes of each identifier in consecutive records.
+    """Return the number of data bytes in the last frame of each identifier in `records`.
 
     A key consists of an identifier and whether it has 29 bits. Error and remote frames are ignored.
     """
@@ -99,7 +99,7 @@ def frame_sizes(records: bytes) -> dict[tuple[int, bool], int]:
 def _record(line: bytes, before_ns: int) -> tuple[int, bytes] | None:
     """Return time and record of one line; None if it is not a classic CAN frame.
 
-    A line without time has the time before.
+    A line without time has the time of the line before.
     """
     match = _LINE.fullmatch(line) or _PLAIN_LINE.fullmatch(line)
     if match is None:

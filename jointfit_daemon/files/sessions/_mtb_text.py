@@ -50,7 +50,7 @@ def read_mtb_session(files: Sequence[Path], name: str) -> SessionData:
     """Return the sensors of one recording, from one exported text file for each sensor.
 
     The counters of all sensors have a common start, so 0 s is the earliest row of all files. The id
-    of a sensor is the serial number at the end of the file name.
+    of a sensor is the serial number at the end of the file name, or else the whole name.
 
     Raises
     ------

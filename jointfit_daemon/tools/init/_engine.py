@@ -117,7 +117,7 @@ def _owner(question: Question, subject: str) -> str:
 
 
 def answered_questions(answers: Mapping[Key, Any], found: Found) -> list[tuple[str, Any]]:
-    """Return the text and the answer of every answered question, in the order of the dialogue."""
+    """Return text and answer of the questions before the first unanswered one, in their order."""
     given = []
     for question, subject in _in_order(answers, found):
         if (question.key, subject) not in answers:
