@@ -173,6 +173,7 @@ async def _explain_silence(
         raise DeviceLostError(
             f"{settings.port}: sends, but does not answer: check the wire from host to device"
         )
+
     received = conversation.received
     port.set_baud(RVC_BAUD)
     rvc = SerialConversation[RvcFrame](port, lambda _: None, RvcCodec)
@@ -182,6 +183,7 @@ async def _explain_silence(
             f"{settings.port}: the device sends UART-RVC: set baud = {RVC_BAUD}, or select "
             "UART-SHTP with PS1 high and PS0 low"
         )
+
     if received or rvc.received:
         raise DeviceMisconfiguredError(
             f"{settings.port}: {received} bytes at {SHTP_BAUD} baud, none of them an SHTP packet: "

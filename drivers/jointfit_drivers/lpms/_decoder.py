@@ -224,6 +224,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
             known = {"model": decode_text(data)}
         else:
             known = {}
+
         text = ", ".join(f"{key} {value}" for key, value in known.items())
         return [DeviceEvent("info", text, known)] if known else []
 

@@ -174,10 +174,12 @@ class LslMarkersDecoder:
         trip = self._trip
         if self._on_lsl_clock is not None or trip is None or self._settings.time == "sender":
             return
+
         host_ns = (
             (trip.sent_ns + trip.received_ns) // 2 + stamp_ns - round(trip.remote_s * NS_PER_S)
         )
         delay_ns = arrival_ns - host_ns
+
         self._on_lsl_clock = -_EARLY_NS <= delay_ns <= _LATE_NS
         if self._on_lsl_clock:
             out.append(_echo(trip))

@@ -36,6 +36,7 @@ class UnitCheck:
         largest = max(abs(x), abs(y), abs(z))
         if not largest < float("inf"):
             return None
+
         self._reports += 1
         self._largest = max(self._largest, largest)
         if self._unit == "m" and self._largest > _LARGEST_M:
@@ -44,6 +45,7 @@ class UnitCheck:
                 f'coordinates up to {self._largest:.0f} with unit = "m": the server seems to send '
                 'millimetres; set unit = "mm" in [mocap]'
             )
+
         if self._unit == "mm" and self._reports == _REPORTS:
             self._reports = _REPORTS + 1
             if self._largest < _SMALLEST_MM:

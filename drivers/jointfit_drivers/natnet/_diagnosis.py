@@ -176,6 +176,7 @@ async def _missing_multicast(
     host, local = route
     name, group = settings.server, str(server["group"])
     port = settings.data_port or int(server["data_port"])
+
     cards = network_cards()
     arrivals = await multicast_arrivals(group, port, host, cards, _MULTICAST_S)
     other = next((c for c in cards if arrivals[c.address] and c.address != local), None)
@@ -185,6 +186,7 @@ async def _missing_multicast(
             f"not at {local}"
         )
         return Finding(CHECK, name, "error", text, f'set interface = "{other.address}" in [mocap]')
+
     text = (
         f"the server answers, but its multicast frames ({group}, UDP port {port}) arrive at no "
         "network card: a firewall or a switch drops them, or streaming is off"

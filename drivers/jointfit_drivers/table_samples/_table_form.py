@@ -98,6 +98,7 @@ def place_fields(
             except FieldFaultError as fault:
                 form.faults.append((f"{key}.{fault.name}".rstrip("."), fault.text))
                 continue
+
             for letter, each in zip(order, placed, strict=True):
                 slot = SLOTS[name][letters.index(letter)]
                 if slot in form.fields:
@@ -190,6 +191,7 @@ def sample_form(form: TableForm, settings: TableImuSettings, *, is_text: bool) -
     slots = tuple(sorted(form.fields))
     measured = [form.fields[slot] for slot in slots if slot < MEASURED]
     clock, per_count = _clock(form, is_text=is_text)
+
     (counter,), (valid,) = SLOTS["counter"], SLOTS["valid"]
     counts, mask, equals = None, -1, None
     if counter in form.fields:
@@ -197,8 +199,10 @@ def sample_form(form: TableForm, settings: TableImuSettings, *, is_text: bool) -
         counts = configured or (None if is_text else form.fields[counter].modulus)
     if valid in form.fields:
         mask, equals = form.parts[valid].mask or -1, form.parts[valid].equals
+
     rate = form.parts.get(SLOTS["rate"].start)
     rate_unit = 1.0 if rate is None else UNITS["rate"].get(rate.unit or "", 1.0)
+
     return SampleForm(
         slots,
         tuple(each.scale for each in measured),

@@ -50,6 +50,7 @@ def bind_subjects(
         for subject in subjects
         for number, marker in enumerate(subject.markers, 1)
     ]
+
     of_bodies = []
     for subject in subjects:
         keys = [member_key(subject.subject, segment.id) for segment in subject.segments]
@@ -60,6 +61,7 @@ def bind_subjects(
             ModelEntry(key, subject.name, segment.name, number)
             for number, (key, segment) in enumerate(zip(keys, subject.segments, strict=True), 1)
         ]
+
     parents = {
         subject.subject: {segment.id: segment.parent for segment in subject.segments}
         for subject in subjects

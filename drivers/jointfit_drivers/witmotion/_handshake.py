@@ -138,6 +138,7 @@ class WitMotionHandshake:
         codec, registers = WitMotionCodec(), None
         counts: dict[int, int] = {}
         began = loop.time()
+
         while (left := began + wait_s - loop.time()) > 0:
             chunk = await self._port.receive(left)
             if chunk is None:
@@ -151,6 +152,7 @@ class WitMotionHandshake:
                 counts[event.kind] = counts.get(event.kind, 0) + 1
             if until is not None and until(counts):
                 break
+
         counts.pop(WitMotionFrameKind.REGISTERS, None)
         seconds = max(loop.time() - began, 1e-3)
         return _Reception(counts, codec.fed, codec.other_frames, seconds, registers)

@@ -308,6 +308,7 @@ def legacy_differences(
         layout = mtdata.MTDataLayout(mode, stored)
     except ValueError as fault:
         return [str(fault)]
+
     faults = []
     for key, found in (("output_mode", mode), ("output_settings", stored)):
         asked = getattr(settings, key)
