@@ -5,6 +5,7 @@ Invariant: only the functions of this module import that package.
 
 from __future__ import annotations
 
+import re
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,6 +22,13 @@ PACKAGE_MISSING = (
     "DBC files need the package cantools: pip install 'jointfitd[dbc]', or give `offset` and "
     "`type` of the fields"
 )
+_MOST_VALUES = 1024
+"""Largest number of values of a multiplexer in one range. `cantools` needs a time proportional to
+the square of the number."""
+_DIGITS = 9
+"""Largest number of digits of a value in a range."""
+_MULTIPLEXED = re.compile(r"SG_MUL_VAL_\s+\d+\s+(?P<signal>\w+)\s+\w+\s+(?P<ranges>[\d\s,-]+);")
+_RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
 _NAMED = 12
 """Largest number of names in one error message."""
 _UNITS = {
@@ -62,10 +70,7 @@ def read_signals(path: str, names: Sequence[str]) -> list[DbcSignal]:
     except OSError as error:
         text = f"{path}: {error.strerror}: correct the name in `dbc`"
         raise FieldFaultError("signals", text) from None
-    messages = _messages(path, stamp)
-    if isinstance(messages, str):
-        raise FieldFaultError("signals", f"{path}: {messages}")
-    return [_signal(name, messages, file.name) for name in names]
+    return [_signal(name, path, stamp) for name in names]
 
 
 @lru_cache(maxsize=8)
@@ -75,13 +80,32 @@ def _messages(path: str, stamp: int) -> list[Any] | str:
     import cantools  # noqa: PLC0415 - an extra
 
     try:
+        if fault := _range_fault(Path(path).read_bytes().decode("latin-1")):
+            return fault
         database = cantools.database.load_file(path, database_format="dbc", strict=True)
     except (cantools.Error, UnicodeDecodeError, OSError) as error:
         return f"cannot be read ({error}): correct the file"
     return list(getattr(database, "messages", []))
 
 
-def _signal(name: str, messages: Sequence[Any], file: str) -> DbcSignal:
+def _range_fault(text: str) -> str | None:
+    """Return why the values of a multiplexer cannot be used; None if they can."""
+    for line in _MULTIPLEXED.finditer(text):
+        for first, last in _RANGE.findall(line["ranges"]):
+            if len(last) > _DIGITS or int(last) - int(first[:_DIGITS]) >= _MOST_VALUES:
+                return (
+                    f"SG_MUL_VAL_ of {line['signal']} has the range {first}-{last}, expected at "
+                    f"most {_MOST_VALUES} values: list the values that the device sends"
+                )
+    return None
+
+
+@lru_cache(maxsize=128)
+def _signal(name: str, path: str, stamp: int) -> DbcSignal:
+    messages = _messages(path, stamp)
+    if isinstance(messages, str):
+        raise FieldFaultError("signals", f"{path}: {messages}")
+    file = Path(path).name
     message_name, _, signal_name = name.rpartition(".")
     found = [
         (message, signal)
@@ -125,6 +149,11 @@ def _multiplexer(message: Any, signal: Any) -> Multiplexer | None:
 
     A multiplexer may itself be multiplexed (extended multiplexing). All of them are then one
     multiplexer with the bits of all.
+
+    Raises
+    ------
+    FieldFaultError
+        The multiplexer has none of the values.
     """
     if signal.multiplexer_ids is None:
         return None
@@ -138,8 +167,14 @@ def _multiplexer(message: Any, signal: Any) -> Multiplexer | None:
         return int.from_bytes(data, "little")
 
     mask = at_its_bits(place.modulus - 1)
-    values = {at_its_bits(value) for value in signal.multiplexer_ids}
-    if outer := _multiplexer(message, selecting):
-        mask |= outer.mask
-        values = {value | other for value in values for other in outer.values}
-    return Multiplexer(mask, frozenset(values))
+    possible = [value for value in signal.multiplexer_ids if 0 <= value < place.modulus]
+    if not possible:
+        text = (
+            f"{message.name}.{signal.name} is present at {selecting.name} = "
+            f"{signal.multiplexer_ids[0]}, but {selecting.name} has {place.bits} bits: correct the "
+            "DBC file"
+        )
+        raise FieldFaultError("signals", text)
+    inner = Multiplexer(mask, frozenset(map(at_its_bits, possible)))
+    outer = _multiplexer(message, selecting)
+    return inner & outer if outer else inner

@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import DeviceEvent
+from jointfit_daemon.name_lists import list_names
 from jointfit_drivers.bus_events import BusEvents
 from jointfit_drivers.table_samples import RecordSamples, SampleForm, TableRecord
 from jointfit_protocols import can
@@ -23,6 +24,11 @@ if TYPE_CHECKING:
 
 _HALVED = 20
 """Number of incomplete samples, before the first complete sample, that causes a warning."""
+_UNMATCHED = 200
+"""Number of frames with unknown values of the multiplexer, before the first complete sample, that
+causes a warning."""
+_LISTED = 6
+"""Largest number of frames in a warning."""
 
 
 class CanTableDecoder:
@@ -77,10 +83,26 @@ class CanTableDecoder:
             self._never_complete = False
             t_ns, values, data = sample
             out += self._samples.take(TableRecord(t_ns, values, self._size, data))
-        if self._never_complete and self._codec.incomplete >= _HALVED:
+        codec = self._codec
+        if self._never_complete and (
+            codec.incomplete >= _HALVED or (codec.unmatched >= _UNMATCHED and codec.absent)
+        ):
             self._never_complete = False
-            out.append(DeviceEvent("warning", _INCOMPLETE))
+            out.append(DeviceEvent("warning", self._reason()))
         return out
+
+    def _reason(self) -> str:
+        """Return the reason why no sample is complete, with its remedy."""
+        absent = self._codec.absent
+        if not absent:
+            return _INCOMPLETE
+        text = f"no complete sample, because {list_names(absent, _LISTED)} never arrived"
+        if not self._codec.unmatched:
+            return f"{text}: switch the frames on in the device, or correct `ids`"
+        return (
+            f"{text}; {self._codec.unmatched} frames have these identifiers, but other values of "
+            "the multiplexer: correct `starts_with` or `dbc`, or switch the frames on in the device"
+        )
 
     def flush(self) -> list[Decoded]:
         """Discard an incomplete sample, and a sample that waits for confirmation."""

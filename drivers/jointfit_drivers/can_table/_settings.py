@@ -26,13 +26,13 @@ from jointfit_drivers.table_samples import (
     sample_form,
 )
 from jointfit_protocols.can import EXTENDED_MAX, STANDARD_MAX
-from jointfit_protocols.table import MEASURED, CanTable, Multiplexer
+from jointfit_protocols.table import MEASURED, CanTable, Multiplexer, TableField
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from jointfit_drivers.ports.can_bus import CanKey
-    from jointfit_protocols.table import Quantity, TableField
+    from jointfit_protocols.table import Quantity
 
 _FRAME_BYTES = 8
 _HEX_BYTES = r"^\s*([0-9A-Fa-f]{2}\s*){1,8}$"
@@ -122,10 +122,14 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
             return
         form = self.places()
         yield from form.faults
-        yield from self._multiplexers()[1]
-        yield from self._shared_id_faults()
+        multiplexer_faults = self._multiplexers()[1]
+        yield from multiplexer_faults
+        if multiplexer_faults:
+            return  # the other faults would be consequences
         sizes = dict.fromkeys(range(len(self.ids)), _FRAME_BYTES)
-        yield from overlap_faults(form, {}, sizes)
+        yield from overlap_faults(form, self._first_bytes(), sizes)
+        if not form.faults or self.dbc is None:  # a faulty signal has no multiplexer
+            yield from self._shared_id_faults()
         if form.faults:
             return
         unused = [
@@ -233,17 +237,28 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
             found[order.index(name)] = Multiplexer(mask, frozenset({value}))
 
         for quantity, number, multiplexer in self._multiplexed_signals():
-            before = found.setdefault(number, multiplexer)
-            common = before.values & multiplexer.values
-            if before.mask != multiplexer.mask or not common:
-                text = (
-                    f"is not in the same frames as the rest of {order[number]!r}, because it is "
-                    "multiplexed: give each value of the multiplexer a frame of its own in `ids`"
-                )
-                faults.append((f"fields.{quantity}", text))
-            else:
-                found[number] = Multiplexer(before.mask, common)
-        return found, faults
+            common = found.get(number, multiplexer) & multiplexer
+            if common.values:
+                found[number] = common
+                continue
+            text = (
+                f"is not in the same frames as the rest of {order[number]!r}, because it is "
+                "multiplexed: give each value of the multiplexer a frame of its own in `ids`"
+            )
+            if order[number] in self.starts_with:
+                text += ", and correct or remove `starts_with`"
+            faults.append((f"fields.{quantity}", text))
+        return found, list(dict.fromkeys(faults))
+
+    def _first_bytes(self) -> dict[str, TableField]:
+        """Return the positions of `starts_with`, by the keys in rig.toml."""
+        order = self.order()
+        return {
+            f"starts_with.{name}": TableField(
+                0, "u", 8 * len(bytes.fromhex(digits)), frame=order.index(name)
+            )
+            for name, digits in self.starts_with.items()
+        }
 
     def _multiplexed_signals(self) -> Iterator[tuple[str, int, Multiplexer]]:
         """Yield quantity, frame and multiplexer of each multiplexed signal of the DBC file."""

@@ -46,6 +46,17 @@ class Multiplexer(NamedTuple):
         """Return whether the data are those of the frame."""
         return len(data) >= self.size and int.from_bytes(data, "little") & self.mask in self.values
 
+    def __and__(self, other: Multiplexer) -> Multiplexer:
+        """Return the multiplexer of the data that match both."""
+        shared = self.mask & other.mask
+        values = frozenset(
+            one | another
+            for one in self.values
+            for another in other.values
+            if one & shared == another & shared
+        )
+        return Multiplexer(self.mask | other.mask, values)
+
     def excludes(self, other: Multiplexer) -> bool:
         """Return whether no data match both."""
         shared = self.mask & other.mask
@@ -112,6 +123,9 @@ class CanTableCodec:
         """Number of samples without all their measurements."""
         self.foreign = 0
         """Number of frames of other devices."""
+        self.unmatched = 0
+        """Number of frames with the identifier of a multiplexed frame, but other data."""
+        self._arrived: set[int] = set()
 
     def feed(self, frame: CanFrame) -> CanSample | CorruptBytes | None:
         """Return the sample that `frame` completes; None if it completes none."""
@@ -122,6 +136,7 @@ class CanTableCodec:
         if number is None or error or remote:
             self.foreign += 1
             return None
+        self._arrived.add(number)
 
         part = self._parts[number]
         if len(data) < part.size:
@@ -150,11 +165,22 @@ class CanTableCodec:
             self.incomplete += 1
         self._begin()
 
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """Names and identifiers of the frames that have never arrived."""
+        return tuple(
+            f"{part.name} (0x{self._table.keys[number][0]:X})"
+            for number, part in enumerate(self._parts)
+            if number not in self._arrived
+        )
+
     def _select(self, key: CanKey, data: bytes) -> int | None:
         """Return the number of the multiplexed frame that has these data."""
-        for multiplexer, number in self._multiplexed.get(key, ()):
+        pages = self._multiplexed.get(key, ())
+        for multiplexer, number in pages:
             if multiplexer.matches(data):
                 return number
+        self.unmatched += bool(pages)
         return None
 
     def _finish(self) -> CanSample | None:

@@ -145,6 +145,14 @@ Q = {"offset": 2, "type": "i16", "divisor": 32767}
             "ids.b: 0x200 is that of a already: give each its own, or the data bytes with which",
         ),
         (
+            on_can(
+                {"quaternion": Q | {"offset": 0}},
+                ids={"quaternion": 0x200},
+                starts_with={"quaternion": "01"},
+            ),
+            "fields.quaternion: shares byte 0 with starts_with.quaternion: correct offset or type",
+        ),
+        (
             on_can({"quaternion": Q | {"offset": 0}}, starts_with={"quat": "01"}),
             "starts_with.quat: expected a name of `ids`: time, quaternion",
         ),
@@ -354,11 +362,56 @@ def test_signals_of_different_pages_in_one_frame_are_named(tmp_path: Path) -> No
     (tmp_path / "pages.dbc").write_text(PAGES.format(page="0|4@1+"))
     table = on_can(RAW_SIGNALS, dbc=str(tmp_path / "pages.dbc"), ids={"all": 512})
     text = "fields.acceleration: is not in the same frames as the rest of 'all'"
-    assert any(text in each for each in faults(table))
+    (fault,) = faults(table)  # consequences of this fault are not reported
+    assert text in fault
     fields = RAW_SIGNALS | {"counter": {"signals": ["NUMBER"]}}
     table = on_can(fields, dbc=table["dbc"], ids={"rate": 512, "acceleration": 512})
     text = "fields.counter.frame: expected one of rate, acceleration, which have the identifier"
     assert any(text in each for each in faults(table)), faults(table)
+
+
+def test_first_bytes_and_pages_of_pages_select_the_frames_that_match_all(tmp_path: Path) -> None:
+    pytest.importorskip("vqf")
+    pytest.importorskip("cantools")
+    (tmp_path / "pages.dbc").write_text(PAGES.format(page="0|4@1+"))
+    table = on_can(
+        RAW_SIGNALS | {"counter": {"signals": ["Q0"], "frame": "page"}},
+        dbc=str(tmp_path / "pages.dbc"),
+        ids={"page": 512, "rate": 512, "acceleration": 512},
+        sequence=["page", "rate", "acceleration"],
+        starts_with={"rate": "51 AA"},
+        orientation="gateway",
+    )
+    table["fields"]["time"] = {"signals": ["TEMPERATURE"], "frame": "page", "unit": "s"}
+    assert faults(table) == []
+    settings = parse_rig(rig_of(table)).sources[1].settings
+    assert isinstance(settings, CanTableSettings)
+    page, rate, _ = (settings.multiplexers()[at] for at in range(3))
+    assert page == Multiplexer(0xFF0F, frozenset({0x0703, 0x0803}))
+    assert rate == Multiplexer(0xFFFF, frozenset({0xAA51}))
+
+    table["starts_with"] = {"rate": "52 AA"}
+    (fault,) = faults(table)
+    assert "is not in the same frames as the rest of 'rate'" in fault
+    assert "correct or remove `starts_with`" in fault
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ("300-301", "RAW.Q1 is present at PAGE = 300, but PAGE has 4 bits: correct the DBC file"),
+        ("1-70000", "SG_MUL_VAL_ of Q1 has the range 1-70000, expected at most 1024 values"),
+        ("1-" + "9" * 5000, "expected at most 1024 values: list the values"),
+    ],
+)
+def test_values_that_a_multiplexer_cannot_have_are_named(
+    tmp_path: Path, values: str, expected: str
+) -> None:
+    pytest.importorskip("cantools")
+    text = PAGES.format(page="0|4@1+").replace("Q1 TEMPERATURE 9-9", f"Q1 PAGE {values}")
+    (tmp_path / "pages.dbc").write_text(text.replace("Q1 m9 : 32|16", "Q1 m9 : 48|16"))
+    table = on_can({"time": {"signals": ["Q1"], "unit": "s"}}, dbc=str(tmp_path / "pages.dbc"))
+    assert any(expected in each for each in faults(table)), faults(table)
 
 
 def test_pages_of_a_page_are_found_by_both_multiplexers(tmp_path: Path) -> None:
