@@ -38,6 +38,9 @@ LINE_SPEEDS = (115_200, 921_600, 460_800, 230_400, 57_600, 38_400, 19_200, 9_600
 """Line speeds for the search, bit/s: factory settings and usual speeds first."""
 _LISTEN_S = 0.15
 """Duration of the search at each speed, s."""
+_QUIET_S = 1.2
+"""Time without a byte after which the bytes before were noise, s. Other devices may send once a
+second."""
 _STORE_S = 3.0
 """Longest wait for the acknowledgement of a flash write, s."""
 _FIRST_S, _FIRST_PERIODS = 1.0, 5
@@ -214,7 +217,7 @@ class LpmsHandshake:
 
         self._port.set_baud(settings.baud)
         conversation.reset()
-        await conversation.wait_for_data(_LISTEN_S)
+        await conversation.wait_for_data(_QUIET_S)
         if not conversation.received:
             raise DeviceLostError(
                 f"{self._path}: some bytes of noise, then silence: check its power and cable, and "

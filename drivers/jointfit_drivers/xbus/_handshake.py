@@ -33,6 +33,9 @@ LINE_SPEEDS = (921_600, 115_200, 460_800, 230_400, 2_000_000, 57_600, 38_400, 19
 """Line speeds for the search, bit/s: factory settings and usual speeds first."""
 _LISTEN_S = 0.15
 """Duration of the search at each speed, s. An acknowledgement takes 10 ms at 9600 baud."""
+_QUIET_S = 1.2
+"""Time without a byte after which the bytes before were noise, s. Other devices may send once a
+second."""
 _RESETS, _RESET_WAIT_S = 50, 0.1
 """Number of requests after a reset, and the interval between them, s. An MTi-G-700 that had not
 answered before replied 1.8 s after its reset."""
@@ -259,7 +262,7 @@ class XbusHandshake:
                 f"{self._path}: silent: check its power, and that TX and RX are not swapped"
             )
 
-        await self._listen_at(self._settings.baud)
+        await self._listen_at(self._settings.baud, _QUIET_S)
         if not conversation.received:
             raise DeviceLostError(
                 f"{self._path}: some bytes of noise, then silence: check its power and cable, and "
@@ -284,10 +287,10 @@ class XbusHandshake:
             self._port, self._conversation, LINE_SPEEDS, self._settings.baud, answers
         )
 
-    async def _listen_at(self, baud: int) -> bool:
+    async def _listen_at(self, baud: int, listen_s: float = _LISTEN_S) -> bool:
         self._port.set_baud(baud)
         self._conversation.reset()
-        return await self._conversation.enter_config(tries=1, wait_s=_LISTEN_S)
+        return await self._conversation.enter_config(tries=1, wait_s=listen_s)
 
 
 def legacy_differences(

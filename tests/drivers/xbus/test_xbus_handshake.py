@@ -251,6 +251,22 @@ async def test_a_late_answer_of_a_port_without_a_speed_is_no_other_speed(tmp_pat
         assert "too late" in await refusal(make(tmp_path), DeviceLostError)
 
 
+async def test_a_slow_device_of_another_kind_is_no_noise(tmp_path: Path) -> None:
+    line = PtyLine(tmp_path / "imu")
+
+    async def send() -> None:
+        while True:
+            line.write(b"\x55\x53\x01\x02\x03")
+            await asyncio.sleep(0.5)
+
+    tasks = [asyncio.create_task(line.serve(lambda _: None)), asyncio.create_task(send())]
+    assert "is not Xbus" in await refusal(make(tmp_path), DeviceMisconfiguredError)
+    for task in tasks:
+        task.cancel()
+    await asyncio.wait(tasks)
+    line.unplug()
+
+
 async def test_noise_before_silence_is_reported_without_figures(tmp_path: Path) -> None:
     line, asked = PtyLine(tmp_path / "imu"), asyncio.Event()
     serving_line = asyncio.create_task(line.serve(lambda _: asked.set()))
