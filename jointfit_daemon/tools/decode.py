@@ -91,6 +91,10 @@ class CaptureSummary:
         return found | ({"mocap_frames": self.frames} if self.frames else {})
 
 
+_MOST_DISCARDED = 0.9
+"""Share of discarded bytes above which a capture without orientations is of another device."""
+
+
 def decode(
     protocol: Annotated[
         str,
@@ -142,7 +146,11 @@ def decode(
     else:
         rejected = [f"{number} rejected: {text}" for text, number in counts.reasons.most_common()]
         _print_table(found, rejected + counts.warnings)
-        if not found["quaternions"]:
+        # Bytes of another device may contain a few messages by chance.
+        is_other = decoder.discarded_bytes > _MOST_DISCARDED * file.stat().st_size
+        if not found["quaternions"] and is_other:
+            typer.echo(f"{file}: {_why_nothing_found(file, driver, protocol)}", err=True)
+        elif not found["quaternions"]:
             typer.echo(_missing_orientations(driver, counts), err=True)
 
 
@@ -186,7 +194,7 @@ def _why_nothing_found(file: Path, driver: type[Driver], name: str) -> str:
     if not file.stat().st_size:
         return "the file is empty: record again while the device sends"
     chunks = list(_read(file, driver))
-    text, others = f"no message of {name}", []
+    text, others = f"no usable message of {name}", []
     if driver.wire == "can":
         sizes = frame_sizes(b"".join(chunk.data for chunk in chunks))
         shown = ", ".join(f"{number:#x}" for number, _ in sorted(sizes)[:MOST_SHOWN])

@@ -274,6 +274,15 @@ def test_an_empty_capture_and_a_capture_of_another_device_are_named(
     assert "jointfit decode xbus" in refusal("mip", str(xsens(shared_data, 5)))
 
 
+def test_a_message_by_chance_does_not_hide_the_device_of_a_capture(tmp_path: Path) -> None:
+    file = tmp_path / "other.bin"
+    device_message = bytes.fromhex("FA FF 31 00 D0")  # acknowledgement without content
+    file.write_bytes(device_message + 400 * b"\x55\x51\x00\x01")
+    result = run(app, ["decode", "xbus", str(file)])
+    assert "messages" in result.stdout
+    assert "no usable message of xbus in 1605 bytes: select the driver" in result.stderr
+
+
 def test_frames_of_a_can_capture_lead_to_the_identifiers_and_the_command(tmp_path: Path) -> None:
     log = tmp_path / "can.log"
     lines = [f"({k / 100:.6f}) can0 131#0000000000004000" for k in range(50)]
