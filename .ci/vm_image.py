@@ -15,6 +15,7 @@ SIZE = "2G"  # sparse file for package and test data
 PACKAGES = (
     "systemd", "systemd-sysv", "udev", "dbus", "kmod", "iproute2", "procps", "python3",
     "python3-pytest", "mosquitto", "mosquitto-clients", "openssl", "can-utils",
+    "python3-numpy", "python3-scipy",
 )  # fmt: skip
 TOOLS = {"mmdebstrap": "mmdebstrap", "mke2fs": "e2fsprogs", "fakeroot": "fakeroot"}
 HOOKS = (

@@ -1,15 +1,17 @@
 #!/usr/bin/env python3
 """Build the Debian package: `python packaging/deb.py [--arch amd64|arm64] [--out DIR]`.
 
-Invariant: the content depends only on ``requirements.lock``, the commit and the C compiler. The
-same commit yields identical bytes (SOURCE_DATE_EPOCH; the default is the time of the commit).
-Wheels are only unpacked, so a package for another architecture can also be built. Only a package
-for the architecture of this machine contains compiled modules (packaging/compiled.py), if a C
-compiler exists.
+Invariant: the content depends only on ``requirements.lock``, the commit, and Python and C compiler
+of this machine. The same commit yields identical bytes (SOURCE_DATE_EPOCH; the default is the time
+of the commit). Wheels are only unpacked, so a package for another architecture can also be built.
+Only a package for the architecture of this machine contains compiled modules
+(packaging/compiled.py), if a C compiler exists.
 
-The package contains its own site-packages. Its interpreter /usr/lib/jointfitd/bin/python3 is a link
-to Debian's Python. Other programs cannot import packages of jointfitd, and jointfitd cannot import
-theirs.
+The package contains its own site-packages, for all Python versions in `PYTHONS`: the names of
+extension modules contain the Python version, and all other files are the same for all versions. Its
+interpreter /usr/lib/jointfitd/bin/python3 is a link to Debian's Python. Other programs cannot
+import packages of jointfitd. jointfitd can import only `FROM_DEBIAN` of Debian's packages, through
+links.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import argparse
 import compileall
 import gzip
 import hashlib
+import json
 import os
 import platform
 import py_compile
@@ -35,6 +38,12 @@ ROOT = Path(__file__).resolve().parents[1]
 DEBIAN = Path(__file__).with_name("debian")
 HOME = Path("usr/lib/jointfitd")
 PYTHON = f"{sys.version_info.major}.{sys.version_info.minor}"
+"""Python version of this machine, for which the package contains compiled modules and bytecode."""
+PYTHONS = ("3.11", "3.12", "3.13")
+"""Python versions of Debian 12, Ubuntu 24.04 and Debian 13."""
+FROM_DEBIAN = ("numpy", "scipy")
+"""Libraries that Debian provides. They are three quarters of the size of all libraries."""
+DEBIAN_PACKAGES = Path("/usr/lib/python3/dist-packages")
 THIS_ARCHITECTURE = {"x86_64": "amd64", "aarch64": "arm64"}.get(platform.machine())
 PLATFORMS = {
     "amd64": ("manylinux_2_28_x86_64", "manylinux_2_17_x86_64", "manylinux2014_x86_64"),
@@ -82,7 +91,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "packages", metavar="DIR")
     parser.add_argument("--version", help="as in the control file (default: that of the project)")
     options = parser.parse_args()
-    version = options.version or f"{_project_version()}-1+py{PYTHON.replace('.', '')}"
+    version = options.version or f"{_project_version()}-1"
     epoch = os.environ.get("SOURCE_DATE_EPOCH") or _commit_time()
     with tempfile.TemporaryDirectory(prefix="jointfitd-deb-") as scratch:
         tree = Path(scratch) / "tree"
@@ -126,35 +135,23 @@ def _commit_time() -> str:
 
 def _install_python(tree: Path, scratch: Path, architecture: str, epoch: str) -> None:
     """Unpack the wheel of this project and its dependencies into the package's site-packages."""
-    site = tree / HOME / "lib" / f"python{PYTHON}" / "site-packages"
-    pip: list[str | Path] = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
+    site = tree / HOME / "lib" / "python3" / "site-packages"
+    site.mkdir(parents=True)
     is_compiled = architecture == THIS_ARCHITECTURE and compiler() is not None
-    _run(
-        [
-            *pip, "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", scratch,
-            ROOT,
-        ],
-        epoch,
-        JOINTFIT_COMPILED=str(int(is_compiled)),
-    )  # fmt: skip
-    wheel = next(scratch.glob("jointfitd-*.whl"))
-    names = list(PLATFORMS[architecture])
-    if is_compiled:  # a compiled wheel has the platform tag of this machine
-        names.append(f"linux_{platform.machine()}")
-    platforms = [word for name in names for word in ("--platform", name)]
-    _run(
-        [
-            *pip, "install", "--quiet", "--target", site, "--only-binary=:all:", "--no-compile",
-            "--implementation", "cp", "--python-version", PYTHON, *platforms,
-            "--constraint", ROOT / "requirements.lock", f"jointfitd[{EXTRAS}] @ {wheel.as_uri()}",
-        ],
-        epoch,
-    )  # fmt: skip
-    for leftover in ("bin", "share", "lib", "include"):  # remove scripts and data of wheels
-        shutil.rmtree(site / leftover, ignore_errors=True)
+    # The version of this machine first: its metadata name the compiled modules.
+    for python in sorted(PYTHONS, key=PYTHON.__ne__):
+        wheel = _build_wheel(scratch / f"wheel-{python}", epoch, is_compiled and python == PYTHON)
+        unpacked = scratch / f"site-{python}"
+        _unpack(wheel, unpacked, python, architecture, epoch)
+        for leftover in ("bin", "share", "lib", "include"):  # remove scripts and data of wheels
+            shutil.rmtree(unpacked / leftover, ignore_errors=True)
+        _merge(unpacked, site)
+        (tree / HOME / "lib" / f"python{python}").symlink_to("python3")
     for record in site.glob("*.dist-info/direct_url.json"):  # contains a path of this machine
         record.unlink()
     _drop_tests(site)
+    for name in FROM_DEBIAN:
+        (site / name).symlink_to(DEBIAN_PACKAGES / name)
     (site / "local-drivers.pth").write_text(f"{LOCAL_DRIVERS}\n")
     binaries = tree / HOME / "bin"
     binaries.mkdir(parents=True)
@@ -163,11 +160,71 @@ def _install_python(tree: Path, scratch: Path, architecture: str, epoch: str) ->
         "home = /usr/bin\ninclude-system-site-packages = false\n"
     )
     # Python does not compare these files with their sources, because only the package manager
-    # changes both.
+    # changes both. postinst compiles for other Python versions.
     mode = py_compile.PycInvalidationMode.UNCHECKED_HASH
     compileall.compile_dir(
         site, quiet=2, stripdir=str(tree), prependdir="/", invalidation_mode=mode, workers=1
     )
+
+
+def _pip(*words: str | Path) -> list[str | Path]:
+    return [sys.executable, "-m", "pip", "--disable-pip-version-check", *words]
+
+
+def _build_wheel(folder: Path, epoch: str, is_compiled: bool) -> Path:
+    """Build the wheel of this project and return its path."""
+    words = _pip(
+        "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", folder, ROOT
+    )
+    _run(words, epoch, JOINTFIT_COMPILED=str(int(is_compiled)))
+    return next(folder.glob("jointfitd-*.whl"))
+
+
+def _unpack(wheel: Path, site: Path, python: str, architecture: str, epoch: str) -> None:
+    """Unpack a wheel of this project and the libraries that Debian does not provide."""
+    names = list(PLATFORMS[architecture])
+    if not wheel.name.endswith("-any.whl"):  # a compiled wheel has the platform tag of this machine
+        names.append(f"linux_{platform.machine()}")
+    install = _pip(
+        "install", "--quiet", "--target", site, "--only-binary=:all:", "--no-compile",
+        "--implementation", "cp", "--python-version", python,
+        *(word for name in names for word in ("--platform", name)),
+        "--constraint", ROOT / "requirements.lock",
+    )  # fmt: skip
+    report = site.with_suffix(".json")
+    resolve = ["--dry-run", "--report", report, f"jointfitd[{EXTRAS}] @ {wheel.as_uri()}"]
+    _run([*install, *resolve], epoch)
+    chosen = [
+        (str(each["metadata"]["name"]), str(each["metadata"]["version"]))
+        for each in json.loads(report.read_text(encoding="utf-8"))["install"]
+    ]
+    libraries = [
+        f"{name}=={version}" for name, version in chosen if name not in {"jointfitd", *FROM_DEBIAN}
+    ]
+    _run([*install, "--no-deps", wheel, *libraries], epoch)
+
+
+def _merge(source: Path, site: Path) -> None:
+    """Move the files of one Python version into the site-packages of all versions."""
+    for path in sorted(source.rglob("*")):
+        name = path.relative_to(source)
+        target = site / name
+        if path.is_dir():
+            continue
+        if not target.exists():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            path.replace(target)
+        elif path.read_bytes() != target.read_bytes() and not _differs_by_tag(name):
+            sys.exit(f"{name} is not the same for all Python versions")
+
+
+def _differs_by_tag(name: Path) -> bool:
+    """Return whether a file lists the tag or the files of one wheel."""
+    return name.parent.suffix == ".dist-info" and name.name in {
+        "WHEEL",
+        "RECORD",
+        "direct_url.json",
+    }
 
 
 def _drop_tests(site: Path) -> None:
@@ -216,17 +273,19 @@ def _write_control(tree: Path, version: str, architecture: str) -> None:
     size = sum(path.lstat().st_size for path in tree.rglob("*") if not path.is_dir())
     control = tree / "DEBIAN"
     control.mkdir()
-    major, minor = PYTHON.split(".")
+    major, minor = PYTHONS[-1].split(".")
     text = (DEBIAN / "control").read_text(encoding="utf-8")
     (control / "control").write_text(
         text.format(
             version=version, architecture=architecture, kilobytes=size // 1024,
-            maintainer=MAINTAINER, python=PYTHON, next_python=f"{major}.{int(minor) + 1}",
+            maintainer=MAINTAINER, python=PYTHONS[0], next_python=f"{major}.{int(minor) + 1}",
         )
     )  # fmt: skip
     (control / "md5sums").write_text(_md5sums(tree), encoding="utf-8")
     for name in ("postinst", "prerm", "postrm"):
-        shutil.copyfile(DEBIAN / name, control / name)
+        script = (DEBIAN / name).read_text(encoding="utf-8")
+        script = script.replace("@BYTECODE@", str(sys.implementation.cache_tag))
+        (control / name).write_text(script, encoding="utf-8")
         (control / name).chmod(0o755)
 
 
