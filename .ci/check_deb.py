@@ -1,7 +1,8 @@
 """Check Debian packages without installing them: `check_deb.py PACKAGE...`.
 
-Every library must have the architecture of the package, every file must be listed with its
-checksum, and no file may contain paths of the machine that built it.
+A package has at most `LARGEST` bytes. Every library must have the architecture of the package,
+every file must be listed with its checksum, and no file may contain paths of the machine that built
+it.
 """
 
 import hashlib
@@ -14,6 +15,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 MACHINES = {"amd64": 62, "arm64": 183}
 """Values of the ELF field e_machine for x86-64 and AArch64."""
+LARGEST = 40_000_000
+"""Largest size of a package, bytes."""
 NEEDED = (
     "usr/bin/jointfitd", "usr/lib/systemd/system/jointfitd.service",
     "usr/lib/udev/rules.d/70-jointfitd.rules", "usr/share/man/man1/jointfitd.1.gz",
@@ -24,6 +27,8 @@ NEEDED = (
 
 def faults(package: Path) -> Iterator[str]:
     """Yield the defects of a package."""
+    if (size := package.stat().st_size) > LARGEST:
+        yield f"{size} bytes, at most {LARGEST} are allowed"
     with tempfile.TemporaryDirectory(prefix="check-deb-") as folder:
         tree = Path(folder)
         subprocess.run(["dpkg-deb", "-R", str(package), folder], check=True)  # noqa: S603, S607 - Debian's

@@ -150,6 +150,7 @@ def _install_python(tree: Path, scratch: Path, architecture: str, epoch: str) ->
     for record in site.glob("*.dist-info/direct_url.json"):  # contains a path of this machine
         record.unlink()
     _drop_tests(site)
+    _strip(site, architecture, epoch)
     for name in FROM_DEBIAN:
         (site / name).symlink_to(DEBIAN_PACKAGES / name)
     (site / "local-drivers.pth").write_text(f"{LOCAL_DRIVERS}\n")
@@ -214,17 +215,8 @@ def _merge(source: Path, site: Path) -> None:
         if not target.exists():
             target.parent.mkdir(parents=True, exist_ok=True)
             path.replace(target)
-        elif path.read_bytes() != target.read_bytes() and not _differs_by_tag(name):
+        elif path.read_bytes() != target.read_bytes() and ".dist-info" not in str(name):
             sys.exit(f"{name} is not the same for all Python versions")
-
-
-def _differs_by_tag(name: Path) -> bool:
-    """Return whether a file lists the tag or the files of one wheel."""
-    return name.parent.suffix == ".dist-info" and name.name in {
-        "WHEEL",
-        "RECORD",
-        "direct_url.json",
-    }
 
 
 def _drop_tests(site: Path) -> None:
@@ -232,6 +224,21 @@ def _drop_tests(site: Path) -> None:
     for folder in sorted(site.glob("*/**/tests")):
         if folder.is_dir():
             shutil.rmtree(folder, ignore_errors=True)
+
+
+def _strip(site: Path, architecture: str, epoch: str) -> None:
+    """Remove symbols for debuggers, which are nine tenths of some wheels, as Debian does."""
+    machine = {"amd64": "x86_64", "arm64": "aarch64"}[architecture]
+    program = shutil.which(f"{machine}-linux-gnu-strip")
+    if program is None:
+        print(
+            f"{machine}-linux-gnu-strip is missing, so the package is twice as large: "
+            f"apt install binutils-{machine.replace('_', '-')}-linux-gnu",
+            file=sys.stderr,
+        )
+        return
+    for path in sorted(site.rglob("*.so")):
+        _run([program, "--strip-unneeded", path], epoch)
 
 
 def _install_files(tree: Path) -> None:

@@ -14,7 +14,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from deb import EXTRAS, ROOT
+from deb import EXTRAS, FROM_DEBIAN, ROOT
 
 TOOL = Path(sys.executable).with_name("cyclonedx-py")
 
@@ -32,6 +32,11 @@ def main() -> int:
             sys.executable, "-m", "pip", "--disable-pip-version-check",
             "--python", empty / "bin" / "python", "install", "--quiet",
             "--constraint", ROOT / "requirements.lock", f"{ROOT}[{EXTRAS}]",
+        )  # fmt: skip
+        # The Debian package does not contain these.
+        _run(
+            sys.executable, "-m", "pip", "--disable-pip-version-check",
+            "--python", empty / "bin" / "python", "uninstall", "--quiet", "--yes", *FROM_DEBIAN,
         )  # fmt: skip
         _run(
             TOOL, "environment", "--pyproject", ROOT / "pyproject.toml", "--output-reproducible",
