@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import re
 import shlex
@@ -99,6 +100,20 @@ def test_configuration_is_the_users_and_no_conffile() -> None:
     assert not (DEBIAN / "conffiles").exists()
     assert "! -e /etc/jointfitd/rig.toml" in (DEBIAN / "postinst").read_text()
     assert '"$1" = purge' in (DEBIAN / "postrm").read_text()
+
+
+def test_everything_that_the_virtual_machine_imports_exists() -> None:
+    # there, programs are texts, which no type checker reads
+    found = [
+        (module, name)
+        for path in sorted((ROOT / "tests" / "vm_service").glob("*.py"))
+        for module, name in re.findall(
+            r"from (jointfit_[\w.]+) import (\w+)", path.read_text("utf-8")
+        )
+    ]
+    assert found
+    for module, name in found:
+        assert hasattr(importlib.import_module(module), name), f"{module} has no {name}"
 
 
 def test_every_option_of_the_daemon_is_in_its_manual_page() -> None:

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 KEY = Path("/etc/credstore/jointfitd.request-key")
 SIGN = (
-    "import json, sys; from jointfit_daemon.outputs.mqtt import signed; "
+    "import json, sys; from jointfit_daemon.outputs.mqtt import sign_request; "
     "key = open(sys.argv[1], 'rb').read().strip(); "
-    "print(json.dumps(signed(key, sys.argv[2], json.loads(sys.argv[3]))))"
+    "print(json.dumps(sign_request(key, sys.argv[2], json.loads(sys.argv[3]))))"
 )
 
 
