@@ -193,7 +193,12 @@ def _unpack(wheel: Path, site: Path, python: str, architecture: str, epoch: str)
         "--constraint", ROOT / "requirements.lock",
     )  # fmt: skip
     report = site.with_suffix(".json")
-    resolve = ["--dry-run", "--report", report, f"jointfitd[{EXTRAS}] @ {wheel.as_uri()}"]
+    resolve: list[str | Path] = [
+        "--dry-run",
+        "--report",
+        report,
+        f"jointfitd[{EXTRAS}] @ {wheel.as_uri()}",
+    ]
     _run([*install, *resolve], epoch)
     chosen = [
         (str(each["metadata"]["name"]), str(each["metadata"]["version"]))
