@@ -146,12 +146,11 @@ def decode(
     else:
         rejected = [f"{number} rejected: {text}" for text, number in counts.reasons.most_common()]
         _print_table(found, rejected + counts.warnings)
-        # Bytes of another device may contain a few messages by chance.
-        is_other = decoder.discarded_bytes > _MOST_DISCARDED * file.stat().st_size
-        if not found["quaternions"] and is_other:
-            typer.echo(f"{file}: {_why_nothing_found(file, driver, protocol)}", err=True)
-        elif not found["quaternions"]:
-            typer.echo(_missing_orientations(driver, counts), err=True)
+        if not found["quaternions"]:
+            # Bytes of another device may contain a few messages by chance.
+            is_other = decoder.discarded_bytes > _MOST_DISCARDED * file.stat().st_size
+            other = f"{file}: {_why_nothing_found(file, driver, protocol)}" if is_other else None
+            typer.echo(other or _missing_orientations(driver, counts), err=True)
 
 
 def _read(

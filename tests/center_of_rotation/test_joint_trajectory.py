@@ -158,5 +158,5 @@ def test_planar_noise_is_spatial_noise_for_rotation_about_one_axis() -> None:
     raised = np.column_stack((flat, np.zeros(4)))
     in_space = spatial_noise(np.array([0.2, 0.3, 0.0]), raised, 0.001)
     assert in_space[:2, :2] == pytest.approx(planar_noise(np.array([0.2, 0.3]), flat, 0.001))
-    with pytest.raises(ValueError, match="apart"):
+    with pytest.raises(ValueError, match="two markers at different positions: move one"):
         planar_noise(np.zeros(2), np.zeros((2, 2)), 0.001)
