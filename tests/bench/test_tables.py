@@ -16,7 +16,6 @@ WORDS = re.compile(r"[a-z]+[0-9]*(-[a-z]+)+")  # names of devices end with digit
 
 
 @pytest.mark.experiment
-@pytest.mark.timeout(180)
 @pytest.mark.parametrize("experiment", SHORT, ids=lambda e: f"{e.topic}-{e.id}")
 def test_short_experiment_meets_its_thresholds(experiment: Experiment) -> None:
     reason = experiment.missing()

@@ -324,7 +324,7 @@ async def test_daemon_broker_and_server_are_lost_and_regained_with_a_gap_in_the_
         async with publishing(rig, each_broker.port):
             await page.until_text("#angle-value", "°")
         await page.until_text("#banner", "jointfitd stopped or lost its broker")
-        await page.until_text("#recording", "It completes a file that it was writing")
+        await page.until_text("#recording", "it completes the file that it was writing")
         await show_state(page, "no-daemon")
         async with publishing(rig, each_broker.port):
             await page.until_text("#angle-value", "°")
