@@ -125,7 +125,6 @@ class CanTableCodec:
         """Number of frames of other devices."""
         self.unmatched = 0
         """Number of frames with the identifier of a multiplexed frame, but other data."""
-        self._arrived: set[int] = set()
 
     def feed(self, frame: CanFrame) -> CanSample | CorruptBytes | None:
         """Return the sample that `frame` completes; None if it completes none."""
@@ -136,9 +135,9 @@ class CanTableCodec:
         if number is None or error or remote:
             self.foreign += 1
             return None
-        self._arrived.add(number)
 
         part = self._parts[number]
+        part.has_arrived = True
         if len(data) < part.size:
             found = f"{len(data)} data bytes, expected {part.size}"
             return CorruptBytes(len(data), f"{part.name}: {found}")
@@ -171,7 +170,7 @@ class CanTableCodec:
         return tuple(
             f"{part.name} (0x{self._table.keys[number][0]:X})"
             for number, part in enumerate(self._parts)
-            if number not in self._arrived
+            if not part.has_arrived
         )
 
     def _select(self, key: CanKey, data: bytes) -> int | None:
@@ -209,6 +208,7 @@ class _FramePart:
         self.places = [slots.index(slot) for slot in mine]
         self.measures = any(slot < MEASURED for slot in mine)
         self.name = table.names[number] if table.names else f"frame {number + 1}"
+        self.has_arrived = False
 
 
 def encode_can_frames(
