@@ -134,12 +134,15 @@ def followed(one: Wearer, moved_m: float) -> list[tuple[float, RunningCenter]]:
 
 def moving(tissue_mm: float, shifts_mm: tuple[float, ...], _: Path) -> list[Result]:
     """Count false reports without a shift, and reports of each shift; measure each shift."""
-    shares = []
+    shares, offsets = [], []
     for seed in WEARERS:
-        still = [center.moved for _, center in followed(wearer(seed, tissue_mm), 0.0)]
-        compared = [moved for moved in still if moved is not None]
+        still = [center for _, center in followed(wearer(seed, tissue_mm), 0.0)]
+        compared = [center.moved for center in still if center.moved is not None]
         shares.append(100.0 * sum(compared) / len(compared))
+        last = next(each.shift for each in reversed(still) if each.joint == "knee")
+        offsets.append(inf if last is None else abs(1e3 * last[1]))
     figures = median_and_worst("knee unmoved: estimates with a report", shares, "%", maximum=1.0)
+    figures += median_and_worst("knee unmoved: published shift at the end", offsets, "mm")
 
     for mm in shifts_mm:
         delays, errors = [], []
