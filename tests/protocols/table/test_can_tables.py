@@ -125,3 +125,16 @@ def test_an_unknown_page_is_foreign_and_a_short_one_corrupt() -> None:
     assert codec.foreign == 2
     assert isinstance(codec.feed(CanFrame(0, 0x200, b"\x55\x01" + bytes(3))), CorruptBytes)
     assert isinstance(codec.feed(CanFrame(0, 0x200, b"\x55\x01" + bytes(4))), CanSample)
+
+
+def test_a_frame_too_short_for_the_multiplexer_is_foreign() -> None:
+    # Missing bytes are not zeros.
+    table = CanTable(
+        ((0x200, False),),
+        {0: TableField(0, "i", 8)},
+        multiplexers={0: Multiplexer(0xFF00, frozenset({0}))},
+    )
+    codec = CanTableCodec(table)
+    assert codec.feed(CanFrame(0, 0x200, b"\x05")) is None
+    assert codec.foreign == 1
+    assert isinstance(codec.feed(CanFrame(0, 0x200, b"\x05\x00")), CanSample)
