@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import Field, field_validator
+from pydantic import AfterValidator, Field, field_validator
 from typing_extensions import override
 
 from jointfit_daemon.driver import Settings
@@ -19,6 +19,7 @@ from jointfit_drivers.table_samples import (
     TableForm,
     TableImuSettings,
     binary_place,
+    check_hexadecimal,
     orientation_faults,
     overlap_faults,
     parts_of,
@@ -35,9 +36,14 @@ if TYPE_CHECKING:
     from jointfit_protocols.table import Quantity
 
 _FRAME_BYTES = 8
-_HEX_BYTES = r"^\s*([0-9A-Fa-f]{2}\s*){1,8}$"
 _SHARE_OF_PERIOD = 0.5
 """Longest time between the first and the last frame of a sample, in nominal periods."""
+
+
+def _check_first_bytes(text: str) -> str:
+    if not 1 <= len(bytes.fromhex(check_hexadecimal(text))) <= _FRAME_BYTES:
+        raise ValueError(f'expected 1 to {_FRAME_BYTES} bytes in hexadecimal, such as "AA 55"')
+    return text
 
 
 class CanFieldSettings(FieldSettings):
@@ -80,7 +86,7 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
     extended_ids: bool = Field(
         False, description="29-bit identifiers even where the numbers would fit 11 bits"
     )
-    starts_with: dict[str, Annotated[str, Field(pattern=_HEX_BYTES)]] = Field(
+    starts_with: dict[str, Annotated[str, AfterValidator(_check_first_bytes)]] = Field(
         {},
         description="first data bytes, hexadecimal, of frames with the same identifier, by the "
         "names of `ids`; frames that begin with other bytes are ignored",
@@ -318,14 +324,9 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
     def _is_readable(self) -> bool:
         """Return whether the keys that define field positions are valid; faulty keys are None."""
         ids: Any = self.ids
-        keys: list[Any] = [
-            self.extended_ids,
-            self.starts_with,
-            self.sequence,
-            self.byte_order,
-            self.rate_hz,
-        ]
+        starts: Any = self.starts_with
+        keys: list[Any] = [self.extended_ids, self.sequence, self.byte_order, self.rate_hz]
         fields: Any = self.fields
-        if None in [ids, fields, *keys] or None in ids.values():
+        if None in [ids, starts, fields, *keys] or None in [*ids.values(), *starts.values()]:
             return False
         return not any(parts is None or None in parts for _, parts in fields)

@@ -17,6 +17,7 @@ from jointfit_drivers.table_samples import (
     TableForm,
     TableImuSettings,
     binary_place,
+    check_hexadecimal,
     orientation_faults,
     overlap_faults,
     parts_of,
@@ -124,11 +125,7 @@ class FrameSettings(Settings):
     @field_validator("sync", "end")
     @classmethod
     def _hexadecimal(cls, text: str) -> str:
-        try:
-            bytes.fromhex(text)
-        except ValueError:
-            raise ValueError('expected bytes in hexadecimal, such as "AA 55"') from None
-        return text
+        return check_hexadecimal(text)
 
     @field_validator("sync")
     @classmethod

@@ -5,6 +5,7 @@ from jointfit_drivers.table_samples._field_settings import (
     ChecksumSettings,
     FieldSettings,
     TableImuSettings,
+    check_hexadecimal,
     parts_of,
 )
 from jointfit_drivers.table_samples._record_samples import RecordSamples
@@ -38,6 +39,7 @@ __all__ = [
     "TableImuSettings",
     "TableRecord",
     "binary_place",
+    "check_hexadecimal",
     "duration_ns",
     "orientation_faults",
     "overlap_faults",

@@ -14,6 +14,21 @@ _MOST_BYTES = 4095
 """Largest offset of a field in a frame, bytes."""
 
 
+def check_hexadecimal(text: str) -> str:
+    """Return a text that contains bytes in hexadecimal.
+
+    Raises
+    ------
+    ValueError
+        The text contains something else.
+    """
+    try:
+        bytes.fromhex(text)
+    except ValueError:
+        raise ValueError('expected bytes in hexadecimal, such as "AA 55"') from None
+    return text
+
+
 class FieldSettings(Settings):
     """One quantity, or some of its components: place, type, scale and unit."""
 
