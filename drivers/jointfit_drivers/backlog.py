@@ -19,8 +19,8 @@ from __future__ import annotations
 _SKEW = 0.001
 """Margin m, relative. It is twice the largest plausible skew of a device clock."""
 _BURST_SHARE = 0.5
-"""Share of the advance of device time. If a message arrives earlier than the shortest delay permits
-by more than this share, it is part of a burst."""
+"""Share of the advance of device time. A message is part of a burst if it arrives earlier than the
+shortest delay permits, by more than this share."""
 
 
 class BacklogDelay:
@@ -30,7 +30,7 @@ class BacklogDelay:
 
     def __init__(self) -> None:
         self._delay = 0.0
-        self._paced = 0.0  # time since the shortest delay was found
+        self._paced = 0.0  # time since the last message of a burst
 
     def feed(self, advance: float, elapsed: float) -> None:
         """Add a message of a device that continued to run.
@@ -55,7 +55,7 @@ class BacklogDelay:
         settle
             Time with messages at the device's own rate after which the delay is known.
         unknown
-            Limit that is returned until the delay is known.
+            Smallest limit that is returned until the delay is known.
         """
         return self._delay if self._paced >= settle else max(self._delay, unknown)
 

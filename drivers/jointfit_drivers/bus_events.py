@@ -22,7 +22,8 @@ class BusEvents:
 
     def __init__(self) -> None:
         self.discarded_bytes = 0
-        """Number of bytes in rejected records and in lines that an adapter lost."""
+        """Number of bytes in rejected records, plus the bytes on an adapter's line that formed no
+        frame."""
         self._text = ""
         self._reported_ns = 0
 

@@ -30,7 +30,7 @@ class CanDecoder(ABC):
     ids : collection of CanKey
         Identifiers of the device: number, and whether it has 29 bits. Other frames are ignored.
     samples : CheckedSamples
-        Checks for samples. `convert` adds its samples to these checks.
+        Checks that `convert` applies to its samples.
     """
 
     def __init__(self, ids: Collection[CanKey], samples: CheckedSamples) -> None:
@@ -59,7 +59,7 @@ class CanDecoder(ABC):
 
     @property
     def discarded_bytes(self) -> int:
-        """Number of bytes in rejected records and in lines that an adapter lost."""
+        """Number of bytes in rejected records, and on an adapter's line that formed no frame."""
         return self._bus.discarded_bytes + self.samples.refused_bytes
 
     def feed(self, chunk: Chunk) -> list[Decoded]:

@@ -11,7 +11,7 @@ from jointfit_drivers.ports.can_bus import bus_faults
 class CanImuSettings(ImuSettings):
     """Connection of an IMU on a CAN bus."""
 
-    can: CanBusSettings = Field(description="name of the [can.NAME] table of its bus")
+    can: CanBusSettings = Field(description="name of the [can.NAME] table of the sensor's bus")
 
     @field_validator("can")
     @classmethod

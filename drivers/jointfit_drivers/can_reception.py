@@ -57,7 +57,7 @@ class CanReception:
         self._settings = settings
         self._configured_by = configured_by
         self._worked = False
-        self._first_s = settings.silence_s  # waiting costs less than reopening
+        self._first_s = settings.silence_s  # wait for the first frame; reopening costs more
 
     async def run(
         self,

@@ -134,7 +134,7 @@ class CheckedSamples(Refusals):
         return out
 
     def _rate_warning(self, ticks: int) -> list[Decoded]:
-        """Return a warning, once, if the first samples have another rate by device time."""
+        """Return a warning, once, if the device time of the first samples shows another rate."""
         last, self._last_ticks = self._last_ticks, ticks
         if last is None:
             return []

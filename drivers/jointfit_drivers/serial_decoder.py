@@ -123,7 +123,7 @@ class SerialDecoder(SerialMessageDecoder[Message]):
     codec, baud, longest
         As described at `SerialMessageDecoder`.
     samples : CheckedSamples
-        Checks for samples. `convert` adds its samples to these checks.
+        Checks that `convert` applies to its samples.
     """
 
     def __init__(

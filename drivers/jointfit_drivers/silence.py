@@ -1,4 +1,4 @@
-"""Finds out why a device on a serial line does not answer, also by a search at other line speeds.
+"""Diagnosis of a device on a serial line that does not answer, with a search at other line speeds.
 
 Invariant: a device that answers at another speed continues to run as before, and its configuration
 is not changed.
@@ -160,7 +160,7 @@ async def explain_missing_messages(
     if not conversation.received:
         raise DeviceLostError(
             f"{port.path}: silent: check its power and cable, and that the device sends without "
-            "being asked"
+            "a request"
         )
     if conversation.understood:
         raise DeviceLostError(

@@ -65,7 +65,7 @@ class TimedSamples(Refusals):
         Function that returns a new filter of raw measurements; None if the device sends
         orientations.
     untimed_remedy : str
-        Remedy for readings without time, for messages.
+        Remedy in the warning about readings without time.
     """
 
     def __init__(self, make_raw: Callable[[], RawSamples] | None, untimed_remedy: str) -> None:
@@ -88,7 +88,8 @@ class TimedSamples(Refusals):
                 text = f"orientation without time in its message: {self._untimed_remedy}"
                 out.append(DeviceEvent("warning", text))
 
-            # A reading without time is stamped with its arrival, unless other readings have a time.
+            # An orientation without time is stamped with its arrival, unless other readings have a
+            # time. The filter of raw measurements needs a time.
             if self._timed or self._make_raw is not None:
                 return [*out, self.refuse(reading.size, "orientation without time")]
             return out + self._samples(reading)

@@ -122,7 +122,7 @@ class ResynchronizingCodec(Generic[M]):
         return found
 
     def flush(self) -> list[M | CorruptBytes]:
-        """End the input, or a silence; return messages that the pending bytes contain."""
+        """Discard an incomplete message; return messages that the other pending bytes contain."""
         found: list[M | CorruptBytes] = []
         while self._pending:
             # The pending bytes begin with an incomplete candidate. The search continues after its

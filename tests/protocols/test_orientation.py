@@ -11,7 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jointfit_protocols.orientation import OrientationGate, canonical, native_of
+from jointfit_protocols.orientation import (
+    OrientationGate,
+    angles_quaternion,
+    canonical,
+    native_of,
+)
 
 unit = (
     st.tuples(*[st.floats(-1, 1)] * 4)
@@ -90,3 +95,50 @@ def test_ten_good_samples_in_a_hundred_are_no_wrong_scale() -> None:
     for number in range(200):
         gate.admit((1.0 if number % 10 == 0 else 0.5, 0.0, 0.0, 0.0))
     assert gate.misconfigured_norm is None
+
+
+def test_ninety_one_rejected_samples_of_the_first_hundred_are_a_wrong_scale() -> None:
+    gate = OrientationGate()
+    for number in range(100):
+        assert not gate.is_decided
+        assert gate.misconfigured_norm is None
+        gate.admit((1.0 if number < 9 else 0.5, 0.0, 0.0, 0.0))
+    assert gate.is_decided
+    assert gate.misconfigured_norm == 0.5
+    for _ in range(500):
+        gate.admit((1.0, 0.0, 0.0, 0.0))
+    assert gate.misconfigured_norm == 0.5  # only the first hundred count
+
+
+def test_samples_without_a_finite_norm_have_no_median() -> None:
+    gate = OrientationGate()
+    for _ in range(100):
+        gate.admit((math.nan, 0.0, 0.0, 0.0))
+    assert gate.misconfigured_norm is not None
+    assert math.isnan(gate.misconfigured_norm)
+
+
+def test_the_tolerance_limits_the_norm_on_both_sides() -> None:
+    gate = OrientationGate(0.05)
+    norms = (0.949, 0.951, 1.049, 1.051)
+    admitted = [gate.admit((0.0, norm, 0.0, 0.0)) is not None for norm in norms]
+    assert admitted == [False, True, True, False]
+
+
+def test_a_restart_of_the_device_restarts_the_continuity_of_signs() -> None:
+    gate = OrientationGate()
+    q, turned = (0.6, 0.0, 0.0, 0.8), (-0.6, 0.0, 0.0, 0.8)
+    assert OrientationGate().admit(turned) == pytest.approx((0.6, 0.0, 0.0, -0.8))
+    assert gate.admit(q) == pytest.approx(q)
+    assert gate.admit(turned) == pytest.approx(turned)
+    gate.forget()
+    assert gate.admit(turned) == pytest.approx((0.6, 0.0, 0.0, -0.8))
+
+
+@given(*[st.floats(-math.pi, math.pi)] * 3)
+def test_angles_are_turned_about_x_then_y_then_z_of_the_world(
+    roll: float, pitch: float, yaw: float
+) -> None:
+    expected = Rotation.from_euler("xyz", [roll, pitch, yaw])
+    found = rotation(angles_quaternion(roll, pitch, yaw))
+    assert (found * expected.inv()).magnitude() < 1e-7

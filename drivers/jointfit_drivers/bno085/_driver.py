@@ -46,7 +46,8 @@ class Bno085Imu:
         Raises
         ------
         DeviceLostError
-            The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
+            The port is absent, in use, unplugged, or silent for ``lost_after_s``. A retry may
+            succeed.
         DeviceMisconfiguredError
             The file is not a serial port, or the device is of another kind, in another mode, or
             does not accept the rate.

@@ -132,7 +132,7 @@ async def ensure_shtp(port: SerialPort, emit: Emit, settings: Bno085Settings) ->
     DeviceMisconfiguredError
         The device is of another kind or in another mode, or does not accept the rate.
     """
-    held: list[Chunk] = []  # not emitted: the pauses between bytes delay the stamps
+    held: list[Chunk] = []  # received during the configuration; emitted at the end
     conversation = ShtpConversation(port, held.append)
     conversation.reset()
     if await conversation.control(product_request(), tries=3) is None:

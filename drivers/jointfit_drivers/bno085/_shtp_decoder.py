@@ -48,8 +48,8 @@ _COUNTS = 256
 _MOST_LOST = 128
 """Smallest step of the report number, modulo 256, that counts as a decrease."""
 _OLDEST = 10_000
-"""Largest age of a measurement at transmission, 100 us. A measurement with a larger age is
-corrupt."""
+"""Largest age of a measurement at transmission, in units of 100 us. A measurement with a larger age
+is corrupt."""
 _RESET_COMPLETE = b"\x01"
 _PERIOD_COUNTS = 200
 """Number of readings after which their measured period replaces the nominal period."""
@@ -248,7 +248,7 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         return out + raw.take(stamp, reading, clipped=clipped)
 
     def _time_of_reading(self, step: int, nominal_ns: float) -> int:
-        """Return the time of a reading, ns, which is its number times the measured period.
+        """Return the time of a reading, ns, which advances by the mean period per reading.
 
         The device has no clock, so the period is computed from the arrivals since the first
         reading.

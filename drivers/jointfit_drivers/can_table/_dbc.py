@@ -1,6 +1,6 @@
 """Positions of signals in CAN frames, from a DBC file. `cantools` (extra ``dbc``) reads the file.
 
-Invariant: only the functions of this module import that package.
+Invariant: only the functions of this module import `cantools`.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class DbcSignal(NamedTuple):
     """Unit of the signal; None if rig.toml has no such unit."""
     multiplexer: Multiplexer | None
     """Values of the multiplexer with which the frame contains the signal; None if every frame
-    does."""
+    contains it."""
 
 
 def read_signals(path: str, names: Sequence[str]) -> list[DbcSignal]:
@@ -89,7 +89,7 @@ def _messages(path: str, stamp: int) -> list[Any] | str:
 
 
 def _range_fault(text: str) -> str | None:
-    """Return why the values of a multiplexer cannot be used; None if they can."""
+    """Return why the values of a multiplexer cannot be used; None if they can be used."""
     for line in _MULTIPLEXED.finditer(text):
         for first, last in _RANGE.findall(line["ranges"]):
             if len(last) > _DIGITS or int(last) - int(first[:_DIGITS]) >= _MOST_VALUES:
@@ -147,8 +147,8 @@ def _place(signal: Any) -> TableField:
 def _multiplexer(message: Any, signal: Any) -> Multiplexer | None:
     """Return the values of the multiplexer with which a frame contains a signal.
 
-    A multiplexer may itself be multiplexed (extended multiplexing). All of them are then one
-    multiplexer with the bits of all.
+    A multiplexer may itself be multiplexed (extended multiplexing). The result then combines the
+    bits of all these multiplexers.
 
     Raises
     ------

@@ -51,8 +51,8 @@ class CanFieldSettings(FieldSettings):
 
     frame: str | None = Field(
         None,
-        description="name in `ids` of the frame that contains it; default: the one with the name "
-        "of the quantity, or the only one",
+        description="name in `ids` of the frame that contains the quantity; default: the frame "
+        "that has the name of the quantity, or the only frame",
     )
     signals: tuple[str, ...] | None = Field(
         None,
@@ -73,7 +73,9 @@ class CanFields(Settings):
     magnetic: Parts = Field((), description="magnetic field, sensor axes, any unit")
     time: Parts = Field((), description="device time of the measurement")
     counter: Parts = Field((), description="number of the sample")
-    valid: Parts = Field((), description="status bits; samples without them are dropped")
+    valid: Parts = Field(
+        (), description="status bits; samples that they mark as invalid are dropped"
+    )
 
 
 class CanTableSettings(CanImuSettings, TableImuSettings):
@@ -84,7 +86,7 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
         examples=[{"quaternion": 0x131}],
     )
     extended_ids: bool = Field(
-        False, description="29-bit identifiers even where the numbers would fit 11 bits"
+        False, description="29-bit identifiers even if the numbers fit 11 bits"
     )
     starts_with: dict[str, Annotated[str, AfterValidator(_check_first_bytes)]] = Field(
         {},
@@ -95,7 +97,7 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
     sequence: tuple[str, ...] = Field(
         (),
         description="names of `ids` in the order in which the device sends the frames of a sample; "
-        "default: the lowest identifier first; frames with the same identifier as in `ids`",
+        "default: the lowest identifier first; equal identifiers in the order of `ids`",
     )
     dbc: str | None = Field(None, description="DBC file with the `signals` of the fields")
     fields: CanFields = Field(description="place, scale and unit of each quantity")
@@ -194,7 +196,7 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
             if getattr(part, key) is not None:
                 raise FieldFaultError(key, "is in the DBC file: remove it")
         if len(signals) != count:
-            text = f"{len(signals)} signals for {count} components: expected one of each"
+            text = f"{len(signals)} signals for {count} components: expected one each"
             raise FieldFaultError("signals", text)
         placed = []
         for found in read_signals(self.dbc, signals):
@@ -316,8 +318,8 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
                 one, other = multiplexers.get(before), multiplexers.get(at)
                 if one is None or other is None or not one.excludes(other):
                     text = (
-                        f"0x{self.ids[name]:X} is that of {owner} already: give each its own, or "
-                        "the data bytes with which each begins in `starts_with`"
+                        f"0x{self.ids[name]:X} is also the identifier of {owner}: correct one of "
+                        "them, or set `starts_with` to the first data bytes of both frames"
                     )
                     yield f"ids.{name}", text
 

@@ -16,12 +16,13 @@ A filter that has just started takes its vertical from one accelerometer measure
 the error of the orientation is 18 degrees in the first second, 6 degrees in the second and 4
 degrees in the third. After that it is as small as usual (experiment
 ``gateway-orientation-start-in-motion``). Orientations are therefore returned only when the filter
-has detected rest or has run for `SETTLE_S`.
+has detected rest or has run for `SETTLE_S`, or for ``settle_s`` if this time is shorter.
 
 With a magnetometer, `StartEstimator` then estimates orientation and gyroscope bias from the
 readings since the start, and continues with every reading. Orientations are returned when their
-standard deviation is at most `SETTLED_SD`. VQF takes over the result at the first rest, or when the
-standard deviation of the bias is at most `KNOWN_BIAS_SD`, or after `CONVERGE_S` at the latest.
+standard deviation is at most `SETTLED_SD`, or after ``settle_s``. VQF takes over the result at the
+first rest, or when the standard deviation of the bias is at most `KNOWN_BIAS_SD`, or after
+`CONVERGE_S` at the latest.
 
 A magnetometer has a delay relative to the gyroscope. For the recorded sensor the delay is 13 ms,
 which causes an error of 8 degrees at an angular rate of 579 degrees per second. The delay is
@@ -66,7 +67,8 @@ MOST_MISSING = 3
 SETTLE_S = 3.0
 """Time constant of the filter's accelerometer, s. The vertical is a mean over this time."""
 LONGEST_SETTLE_S = 8.0
-"""Time after which orientations are returned, however uncertain they are, s."""
+"""Default of ``settle_s``, the time after which orientations are returned, however uncertain they
+are, s."""
 SETTLED_SD = radians(5.0)
 """Standard deviation of the angle of the orientation at which a filter counts as settled, rad."""
 CONVERGE_S = 60.0
@@ -75,9 +77,9 @@ KNOWN_BIAS_SD = radians(0.1)
 """Standard deviation of the bias, rad/s, that VQF reaches in motion (``biasSigmaMotion`` of
 VQF)."""
 FASTEST = 200.0
-"""Largest plausible angular rate, rad/s; equal to 11 000 degrees per second."""
+"""Largest plausible angular rate, rad/s; about 11 000 degrees per second."""
 HARDEST = 5000.0
-"""Largest plausible specific force, m/s^2; equal to 500 g."""
+"""Largest plausible specific force, m/s^2; about 500 g."""
 STRONGEST = 1e6
 """Largest plausible component of the magnetic field in any unit; equal to 1 T in microtesla."""
 FIELD_RATIO = 2.0
@@ -351,7 +353,7 @@ class GatewayOrientation:
         state["accQuat"] = list(multiply_one((w, 0.0, 0.0, -z), q))
         state["delta"] = remainder(2.0 * atan2(z, w), tau)
         state["bias"] = estimator.bias.tolist()
-        # (0.01 deg/s)^2
+        # The unit of this covariance in VQF is (0.01 deg/s)^2.
         state["biasP"] = (degrees(100.0) ** 2 * estimator.bias_covariance).ravel().tolist()
         vqf.state = state
         vqf.setMotionBiasEstEnabled(True)

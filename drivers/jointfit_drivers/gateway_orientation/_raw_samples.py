@@ -223,6 +223,6 @@ def _sample(
 ) -> ImuSample:
     q = oriented.q_world_sensor
     arrival_ns, ticks, counter, status = stamp
-    # The device sends the mean rate since the previous sample, so there is no current rate.
+    # The measured rate may be a mean over the previous interval, so the sample contains no rate.
     rate, force, field = None, reading.force, reading.magnetic
     return ImuSample(arrival_ns, q, q, ticks, counter, status, rate, force, field)

@@ -1,10 +1,10 @@
 r"""Orientation, gyroscope bias and field of an IMU whose orientation filter has just started.
 
-VQF takes the vertical from a mean over 3 s, and the heading from the field relative to that
-vertical. With a magnetic dip of 70 degrees, the error of the heading is 2.7 times the error of the
-vertical. An unknown bias rotates heading and vertical, and VQF does not use the field to estimate
-the bias. This Kalman filter estimates vertical, heading and bias together from gravity and field,
-in steps of `STEP_S`. The state of the filter is
+The orientation filter VQF takes the vertical from a mean over 3 s, and the heading from the field
+relative to that vertical. With a magnetic dip of 70 degrees, the error of the heading is 2.7 times
+the error of the vertical. An unknown bias rotates heading and vertical, and VQF does not use the
+field to estimate the bias. This Kalman filter estimates vertical, heading and bias together from
+gravity and field, in steps of `STEP_S`. The state of the filter is
 
 .. math:: (\varphi, b, v, B_n, B_u)
 
@@ -18,10 +18,10 @@ interval of the readings. The sums extend over the readings of a step:
     \varphi &\leftarrow \varphi - \sum R\,T\,(b - \hat b) \\
     v &\leftarrow v + \sum R f\,T - g\,\Delta t + \varphi \times \sum R f\,T
 
-There are two observations. The velocity of a body part is limited. The mean field of the step is
-:math:`\bar y = B + B \times \varphi`. Deviations from both observations last for about a second.
-The variance of one step is therefore the variance of the deviation times `LASTING_S`, divided by
-the length of the step.
+There are two observations: the velocity of a body part is limited, and the mean field of the step
+is :math:`\bar y = B + B \times \varphi`. In both observations, a deviation lasts for about a
+second. The variance of one step is therefore the variance of the deviation times `LASTING_S`,
+divided by the length of the step.
 
 Invariant: the result depends only on the readings added. The module uses no clock, no device and no
 other filter.
@@ -53,7 +53,8 @@ GRAVITY = 9.81
 SPEED_SD = 0.7
 """Expected standard deviation of the velocity of a body part about its mean, m/s."""
 SPEED_KNOWN_S = 1.0
-"""Weight of the expected velocity relative to the estimated velocity, s."""
+"""Weight of `SPEED_SD` in the estimated standard deviation of the velocity, as the duration of
+equivalent observations, s."""
 FIELD_SD = 0.03
 """Standard deviation of the field during motion, relative to its strength."""
 FIELD_LIMIT = 0.1

@@ -1,7 +1,7 @@
 """Decoder of LPMS sensors on CAN: converts records of CAN frames to samples.
 
-The sensor sends no time and no sequence number. The stamp of a sample is the kernel's receive time
-of its first frame, and losses are detected from the arrivals.
+The sensor sends no time and no sequence number. The stamp of a sample is the arrival of its first
+frame, and losses are detected from the arrivals.
 
 A record of 24 bytes is a message of this sensor, a frame of another device, a note of the host, or
 a rejected record.
@@ -76,7 +76,7 @@ class LpmsCanDecoder:
 
     @property
     def discarded_bytes(self) -> int:
-        """Number of bytes in rejected records and in lines that an adapter lost."""
+        """Number of bytes in rejected records, and on an adapter's line that formed no frame."""
         return self._bus.discarded_bytes
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
@@ -177,7 +177,7 @@ _PLAIN = (1, 2, 3, 4)
 """Channels of w, x, y and z, in the usual order of the frames."""
 _NORM_REMEDY = "change `precision` or `mapping`, and remove `scale`"
 _OUT_OF_ORDER = (
-    "the frames of a quaternion do not follow each other within half a period: change `rate_hz` to "
-    "that of the sensor, and give it ascending identifiers (with LpmsControl) and `ids`; "
+    "the frames of a quaternion do not follow each other within half a period: set `rate_hz` to "
+    "the rate of the sensor, and set ascending identifiers with LpmsControl and in `ids`; "
     'precision = "int16" needs one frame only'
 )

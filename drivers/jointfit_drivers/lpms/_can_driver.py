@@ -44,8 +44,9 @@ class LpmsCanImu:
         """Yield the settings of sensors that may have sent the received frames.
 
         The first frame of a candidate has 8 bytes. It belongs to a node in CANopen style, or is the
-        first of four frames with consecutive identifiers. Each candidate is tried with both
-        precisions. See `jointfit_daemon.device_search`.
+        first of four frames with consecutive identifiers. Each candidate is tried with 16-bit
+        integers, and with floats if its second frame also has 8 bytes. See
+        `jointfit_daemon.device_search`.
         """
         full = {number for (number, long), size in seen.items() if size == FRAME_BYTES and not long}
         for number in sorted(full):

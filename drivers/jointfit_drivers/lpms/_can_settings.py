@@ -49,11 +49,11 @@ class LpmsCanSettings(CanImuSettings, LpmsConventionSettings):
         "heartbeat; `sequential`: four consecutive identifiers",
     )
     ids: LpmsCanIdSettings = Field(
-        description="its four identifiers; all four are needed, because the vendor's sources "
-        "compute sequential identifiers by two different rules",
+        description="identifiers of the four frames; all four are needed, because the vendor's "
+        "sources compute sequential identifiers by two different rules",
     )
     precision: Literal["int16", "float32"] = Field(
-        description="format of its channels, as set with LpmsControl"
+        description="format of the channels, as set with LpmsControl"
     )
     mapping: tuple[int, int, int, int] = Field(
         (1, 2, 3, 4), description="channels that carry w, x, y and z, counted from 1"

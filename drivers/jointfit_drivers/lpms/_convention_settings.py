@@ -14,8 +14,8 @@ class LpmsConventionSettings(Settings):
 
     direction: Literal["world_to_sensor", "sensor_to_world"] = Field(
         "world_to_sensor",
-        description="whether its quaternions map world to sensor coordinates, or the reverse; "
-        "both ROS drivers of the vendor invert them, and [a turn by "
+        description="whether the sensor's quaternions map world to sensor coordinates, or the "
+        "reverse; both ROS drivers of the vendor invert them, and [a turn by "
         "hand](devices/lpms.md#convention) shows which applies",
     )
     world: Literal["NWU", "ENU", "NED"] = Field(

@@ -91,7 +91,7 @@ class LpBusConversation(SerialConversation[LpBusMessage]):
         return None if reply is None else reply.command == LpmsCommand.ACK
 
     async def start_stream(self) -> bool | None:
-        """Start the stream; return whether it was acknowledged or data arrived; None if neither."""
+        """Start the stream; return whether the sensor accepted it, or None without any reply."""
         for _ in range(3):
             replies = _ACKNOWLEDGEMENTS | {LpmsCommand.DATA}
             reply = await self._exchange(LpmsCommand.STREAM_MODE, replies)

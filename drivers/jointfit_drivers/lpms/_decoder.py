@@ -290,7 +290,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
 
 
 def is_text(data: bytes) -> bool:
-    """Return whether `data` are lines of printable ASCII, as the text format of a sensor has."""
+    """Return whether `data` are lines of printable ASCII, like the text format of a sensor."""
     printable = sum(0x20 <= byte < 0x7F or byte in b"\r\n\t" for byte in data)  # noqa: PLR2004 - a generation, or ASCII
     return bool(data) and printable >= _TEXT_SHARE * len(data)
 

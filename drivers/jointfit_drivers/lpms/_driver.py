@@ -39,7 +39,8 @@ class LpmsImu:
         Raises
         ------
         DeviceLostError
-            The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
+            The port is absent, in use, unplugged, or silent for ``lost_after_s``. A retry may
+            succeed.
         DeviceMisconfiguredError
             The file is not a serial port, or no LPMS sensor answers. Or the sensor has another
             speed, generation or address, or does not accept the settings.

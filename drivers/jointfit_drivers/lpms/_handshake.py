@@ -39,8 +39,8 @@ LINE_SPEEDS = (115_200, 921_600, 460_800, 230_400, 57_600, 38_400, 19_200, 9_600
 _LISTEN_S = 0.15
 """Duration of the search at each speed, s."""
 _QUIET_S = 1.2
-"""Time without a byte after which the bytes before were noise, s. Other devices may send once a
-second."""
+"""If no byte arrives for this time, the earlier bytes were noise, s. Devices of other kinds may
+send only once a second."""
 _STORE_S = 3.0
 """Longest wait for the acknowledgement of a flash write, s."""
 _FIRST_S, _FIRST_PERIODS = 1.0, 5
@@ -94,7 +94,7 @@ class LpmsHandshake:
         await self._start()
 
     async def _ensure_generation(self) -> None:
-        """Reject a sensor of the other generation before sending a command that could damage it."""
+        """Reject a sensor of the other generation, whose settings a later command could erase."""
         reply = await self._conversation.read(LpmsCommand.IDENTIFY)
         found = None if reply is None else identify_generation(reply)
         if found is None:
@@ -148,8 +148,8 @@ class LpmsHandshake:
                 found = found.merge(part)
         if found.outputs is None or found.rate_hz is None:
             raise DeviceLostError(
-                f"{self._path}: does not answer the reads of generation {self._table.generation}: "
-                "check `generation` and the wire from host to sensor"
+                f"{self._path}: does not answer the read commands of generation "
+                f"{self._table.generation}: check `generation` and the wire from host to sensor"
             )
         return found
 

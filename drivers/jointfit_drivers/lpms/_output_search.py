@@ -52,7 +52,7 @@ class OutputSearch:
     Parameters
     ----------
     table : CommandTable
-        Generation of the sensor.
+        Commands and outputs of the sensor's generation.
     """
 
     def __init__(self, table: CommandTable) -> None:

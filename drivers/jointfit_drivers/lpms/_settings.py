@@ -37,13 +37,13 @@ class LpmsSettings(SerialImuSettings, LpmsConventionSettings):
         None,
         ge=1,
         le=1_000_000,
-        description="ticks of its time in a second; default: 400 of generation 1, 500 of "
+        description="ticks of the sensor's time per second; default: 400 for generation 1, 500 for "
         "generation 3. A wrong value is reported",
     )
     device_time: Literal["auto", "ticks", "seconds"] = Field(
         "auto",
-        description="form of its time; auto: seconds of generation 1 with firmware up to 1.3.4, "
-        "ticks otherwise",
+        description="format of the sensor's time; auto: seconds for generation 1 with firmware up "
+        "to 1.3.4, otherwise ticks",
     )
 
     @property

@@ -53,7 +53,7 @@ class TickRateCheck:
         self._since: tuple[int, int] | None = None
         self._contradictions = 0
         self.done = False
-        """Whether the check has ended: the unit was confirmed, or reported as wrong."""
+        """Whether the check has ended, with or without a fault."""
 
     def feed(self, tick: int, arrival_ns: int) -> TimeUnitFault | None:
         """Add a data packet. Return the fault once, as soon as it is certain.

@@ -8,7 +8,8 @@ channels have no labels, rig.toml defines the labels, or the names of markers wi
 The convention does not define which of OrientationA to D is the scalar. PhaseSpace sends it first,
 the OptiTrack program of LSL last.
 
-Invariant: the functions are pure. An unknown channel is reported and never guessed.
+Invariant: the functions are pure. An unknown channel is ignored and never guessed. If all channels
+are unknown, a warning reports it.
 """
 
 from __future__ import annotations
@@ -220,7 +221,7 @@ def _described_channels(
 
 
 def _labelled_part(label: re.Match[str]) -> str:
-    """Return the component that the end of a label names; empty if it is of another quantity."""
+    """Return the component that the end of a label names; empty for another quantity."""
     if label["other"]:
         return "euler" if label["other"].lower() == "euler" else ""
     part = label["part"].lower()

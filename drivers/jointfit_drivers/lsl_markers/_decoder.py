@@ -42,12 +42,13 @@ _CLOCK = TickClock(1, None)
 _LATEST_S = 9e9
 """Largest time stamp, s, whose value in nanoseconds fits into 64 bits."""
 _BACKWARDS_NS = NS_PER_S
-"""Decrease of the stamps from which it shows a restart of the sender, ns."""
+"""Smallest decrease of the stamps that shows a restart of the sender, ns."""
 _GAP_PERIODS, _LEAST_GAP_NS = 5, 100_000_000
 """Steps of the stamps of a regular stream, in periods and in ns. If both are exceeded, samples were
 lost. Programs that stamp samples at transmission have a jitter of several periods."""
 _REPEATED = 50
-"""Number of samples with the stamp of the sample before that causes a warning."""
+"""Number of repeated stamps that causes a warning. A stamp is repeated if it equals the stamp of
+the previous sample."""
 _EARLY_NS, _LATE_NS = 500_000_000, 10 * NS_PER_S
 """Largest times by which a stamp on the LSL clock may be later and earlier than its arrival, ns."""
 
@@ -75,11 +76,11 @@ class LslMarkersDecoder:
         self._trip: RoundTrip | None = None
         self._on_lsl_clock: bool | None = None  # None: not known yet
         self._zeros_reported = False
-        self._steps, self._repeated = 0, 0  # all steps of the stamps, and those of 0
+        self._steps, self._repeated = 0, 0  # numbers of all steps of the stamps, and of zero steps
         self.unpublished = 0
-        """Number of samples that arrived before the description of the stream."""
+        """Number of chunks with samples that arrived before the description of the stream."""
         self.suspicious = 0
-        """Number of samples and poses rejected because of implausible numbers."""
+        """Number of samples, positions, poses and clock comparisons rejected as implausible."""
 
     @property
     def tick_clock(self) -> TickClock:
@@ -209,7 +210,7 @@ class LslMarkersDecoder:
             out.append(DeviceEvent("gap", f"{lost} samples lost", {"lost": lost}))
 
     def _count_repeated(self, step_ns: int, out: list[Decoded]) -> None:
-        """Report once per connection that most samples have the stamp of the sample before."""
+        """Report once per connection that most samples have the stamp of the previous sample."""
         self._steps += 1
         self._repeated += step_ns == 0
         if step_ns == 0 and self._repeated == _REPEATED and 2 * self._repeated > self._steps:
@@ -261,7 +262,7 @@ class LslMarkersDecoder:
         if x == y == z == 0.0:
             if not self._zeros_reported:
                 self._zeros_reported = True
-                text = "positions of exactly 0, 0, 0 are read as not seen: the program writes them"
+                text = "positions of exactly 0, 0, 0 are not used: the program writes these zeros"
                 out.append(DeviceEvent("info", f"{text} for occluded markers"))
             return NO_POSITION
         if not (isfinite(x) and isfinite(y) and isfinite(z)):

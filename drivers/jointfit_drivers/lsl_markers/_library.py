@@ -34,9 +34,9 @@ def load_library() -> Any:
         ) from missing
     except (RuntimeError, OSError) as missing:  # pylsl is installed without liblsl
         raise DeviceMisconfiguredError(
-            "mocap.driver: pylsl of lsl-markers finds no library liblsl, which its packages contain"
-            " for x86-64 only: install liblsl (https://github.com/sccn/liblsl) and set PYLSL_LIB to"
-            " its path"
+            "mocap.driver: the package pylsl, which lsl-markers needs, finds no library liblsl."
+            " The packages of pylsl contain liblsl for x86-64 only: install liblsl"
+            " (https://github.com/sccn/liblsl) and set PYLSL_LIB to its path"
         ) from missing
     return pylsl
 

@@ -1,7 +1,7 @@
 """Search for motion-capture streams of LSL, and diagnosis of missing frames.
 
-The search queries the network once. Names of hosts only select among the answers. The diagnosis
-connects in the same way as the driver.
+The search queries the network once for each named host, or once for all hosts. The name of a host
+only selects among the answers. The diagnosis connects in the same way as the driver.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def _search(lsl: Any, hosts: Sequence[str], broadcast: bool, wait_s: float) -> l
     query = LslMarkersSettings(driver="lsl-markers").query()
     found = {}
     for server in [None] if broadcast else list(hosts):
-        # The search always takes its full duration, because any number of streams may answer.
+        # The search takes its full duration, unless `_MOST_STREAMS` streams answer.
         for info in search_streams(lsl, query, server, least=_MOST_STREAMS, wait_s=wait_s):
             found[info.uid()] = info
     return [_describe_server(lsl, info, wait_s) for info in found.values()]

@@ -82,7 +82,7 @@ def _other_streams(streams: Sequence[Any]) -> str:
             [f"{info.name()!r} of {info.hostname()} (type {info.type()!r})" for info in others],
             _LISTED,
         )
-        return f"; the network has {listed}: set stream in [mocap] to the one of the cameras"
+        return f"; the network has {listed}: set stream in [mocap] to the stream of the cameras"
     return (
         ": start the program that sends it, check the name (`jointfit probe --network` lists "
         "streams), and that firewalls pass UDP 16571 and TCP 16572 to 16604"
@@ -196,7 +196,7 @@ class LslSession:
         while not self._stop.is_set():
             found = search_streams(lsl, settings.query(), settings.server, least=2, wait_s=_STEP_S)
             # A source that restarts may be announced twice. The newest announcement is the valid
-            # one. Programs may give all their streams, or those of every PC, the same source_id.
+            # one. A program may give several streams, even on several PCs, the same source_id.
             newest = {
                 (info.source_id() or info.uid(), info.name(), info.type(), info.hostname()): info
                 for info in sorted(found, key=lambda info: info.created_at())
@@ -231,7 +231,7 @@ class LslSession:
             raise DeviceMisconfiguredError(
                 f"{self._name}: the values of {info.name()!r} have the format "
                 f"{kind or 'unknown'}, expected numbers: streams of type Markers are texts of "
-                "events; set stream to that of the camera software, or let it send numbers"
+                "events; set stream to the stream of the camera software"
             )
         if info.channel_count() > MOST_CHANNELS:
             raise DeviceMisconfiguredError(

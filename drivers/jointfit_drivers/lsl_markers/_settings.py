@@ -26,7 +26,7 @@ class LslMarkersSettings(MocapSettings):
         None, min_length=1, description="type of the stream; default: MoCap in any spelling"
     )
     source_id: str | None = Field(
-        None, min_length=1, description="identifier of the source, where names are not unique"
+        None, min_length=1, description="identifier of the source, if names are not unique"
     )
     predicate: str | None = Field(
         None,
@@ -55,10 +55,10 @@ class LslMarkersSettings(MocapSettings):
     )
     time: Literal["lsl", "sender"] = Field(
         "lsl",
-        description="clock of the time stamps: `lsl`: that of LSL on the sending PC; `sender`:"
+        description="clock of the time stamps; `lsl`: the LSL clock of the sending PC; `sender`:"
         " another clock, such as that of the cameras",
     )
-    silence_s: float = Field(5.0, gt=0, description="no sample for this long is a lost stream, s")
+    silence_s: float = Field(5.0, gt=0, description="time without a sample until reconnection, s")
 
     @field_validator("server")
     @classmethod

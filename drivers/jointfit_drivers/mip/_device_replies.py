@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from jointfit_protocols.mip import MipPacket
 
 _SMALL = 1e-4
-"""Largest vector part of a quaternion that counts as no rotation, equal to 0.01 degrees."""
+"""Largest vector part of a quaternion that counts as no rotation. It is equal to a rotation by 0.01
+degrees."""
 _FORMATS = {
     Setup.FORMAT_REPLY: None,
     Setup.IMU_FORMAT_REPLY: 0x80,
@@ -29,7 +30,7 @@ def reply_events(packet: MipPacket) -> list[Decoded]:
     """Return the events of a reply. Unknown fields and fields of unexpected size are ignored."""
     out: list[Decoded] = []
     for descriptor, data in packet.fields:
-        # A refused command is no fault, because the driver tries commands that some models lack.
+        # An unknown command is no fault, because the driver tries commands that some models lack.
         if descriptor == commands.REPLY and len(data) == commands.REPLY_BYTES:
             if data[1] not in {commands.OK, commands.UNKNOWN_COMMAND}:
                 name = f"command 0x{packet.descriptor_set:02X},0x{data[0]:02X}"
@@ -69,8 +70,8 @@ def _events_of(command_set: int, descriptor: int, data: bytes) -> Iterator[Decod
     if not max(map(abs, turn[1:])) <= _SMALL:  # NaN compares false
         text = (
             f"a sensor-to-vehicle transform is stored (w x y z = {stored}): sensor axes are those "
-            "of the vehicle, not the printed ones. Remove it with the tool SensorConnect before "
-            "calibration, or leave it as it is"
+            "of the vehicle, not the printed ones. Remove the transform with SensorConnect "
+            "before calibration, or leave it as it is"
         )
         yield DeviceEvent("warning", text, {"sensor_to_vehicle": stored})
 

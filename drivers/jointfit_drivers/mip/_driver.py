@@ -40,7 +40,8 @@ class MipImu:
         Raises
         ------
         DeviceLostError
-            The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
+            The port is absent, in use, unplugged, or silent for ``lost_after_s``. A retry may
+            succeed.
         DeviceMisconfiguredError
             The file is not a serial port, or no MIP device answers. Or the device uses another
             speed, or cannot send the orientation at this rate.

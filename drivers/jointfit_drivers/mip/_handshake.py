@@ -3,7 +3,8 @@
 The driver reads the settings of the device, and writes only settings that differ. Written settings
 are volatile: without ``persist``, the device returns to its stored settings at the next power-up. A
 fault that may end without a change of the settings raises `DeviceLostError`. All other faults raise
-`DeviceMisconfiguredError`, and the device streams as before.
+`DeviceMisconfiguredError`. The driver then requests the device to resume. Settings that were
+already written keep their new values until the next power-up.
 """
 
 from __future__ import annotations
@@ -97,7 +98,7 @@ class MipHandshake:
 
         try:
             await self._configure()
-        except DeviceMisconfiguredError:  # the device streams as before
+        except DeviceMisconfiguredError:  # resume; settings that were written remain
             await self._conversation.command(CommandSet.BASE, Base.RESUME, tries=1)
             raise
         self._refuse(await self._answer(CommandSet.BASE, Base.RESUME), "refuses to resume")
@@ -192,8 +193,8 @@ class MipHandshake:
     async def _ensure_format(self, stream: StreamCommands, wanted: tuple[FormatEntry, ...]) -> bool:
         """Make the device send the fields `wanted`; return whether the format was written.
 
-        Other fields in the format are kept, as long as the line has the capacity for them. Their
-        decimation matters only for the load of the line.
+        A format with further fields is not written again. A written format contains only the fields
+        `wanted`.
         """
         found = await self._format(stream)
         if set(wanted) <= set(found):

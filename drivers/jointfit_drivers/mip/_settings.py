@@ -17,13 +17,13 @@ class MipSettings(GatewaySettings, SerialImuSettings):
 
     estimator: Literal["filter", "sensor"] = Field(
         "filter",
-        description="orientation of the device: of its estimation `filter` (data set 0x82) or of "
-        "the complementary filter of its `sensor` (0x80), which some models have instead",
+        description="source of the device's orientation: its estimation `filter` (data set 0x82) "
+        "or the complementary filter of its `sensor` (0x80), which some models have instead",
     )
     family: Literal["auto", "current", "legacy"] = Field(
         "auto",
         description="commands of the device: `current` (CV7, GV7, GQ7), `legacy` (GX5, CX5, CV5 "
-        "and older); `auto` asks the device",
+        "and older); `auto`: as the device reports",
     )
     persist: bool = Field(
         False,

@@ -1,14 +1,15 @@
 """Assignment of the columns of frames to the names in rig.toml.
 
-The plain marker name (``T1``) is sufficient if only one model has a marker with that name. A name
-with the name of the model is always possible: ``Thigh/T1``, ``Thigh:T1``, ``Thigh_T1``, or
+The plain marker name (``T1``) is sufficient if only one model has a marker with that name. The
+names of model and marker together are always possible: ``Thigh/T1``, ``Thigh:T1``, ``Thigh_T1``, or
 ``Thigh_1`` with the number of the marker. The same applies to bones, and to bodies inside an asset.
 A column gets the name that rig.toml uses for it. Other columns get the plain name if it is unique,
 and ``Thigh/T1`` if it is not.
 
-Invariant: the functions are pure. Only names matter; ids and orders do not. The time is
-proportional to the size of the model. The number of columns is limited, because the model in one
-datagram can contain 65 000 markers.
+Invariant: the functions are pure. A plain name, or a name with its model, selects the same marker
+whatever its id and the order of the models; ``Thigh_1`` depends on the order of the markers in the
+model. The time is proportional to the size of the model. The number of columns is limited, because
+the model in one datagram can contain 65 000 markers.
 """
 
 from __future__ import annotations
@@ -182,7 +183,7 @@ def _columns(what: str, entries: Sequence[ModelEntry], wanted: Mapping[str, str]
             found.unknown.append(name)
             known = free_entries if len(problems) < _MOST_SUGGESTED else {}
             near = None if fitting else nearest_name(name, islice(known, _MOST_COMPARED))
-            free_entries.pop(near or "", None)  # never bind two names to one marker
+            free_entries.pop(near or "", None)  # a marker is suggested only once
             problem = "is not in the stream" + (f"; did you mean {near!r}?" if near else ".")
             if fitting:
                 choices = [repr(next(iter(e.aliases), e.name)) for e in fitting[:MOST_NAMED]]
@@ -197,7 +198,7 @@ def _columns(what: str, entries: Sequence[ModelEntry], wanted: Mapping[str, str]
             found.warnings.append(text)
             break
         free = None if entry.key in taken else _unused_name(entry, plain, used)
-        if free is not None:  # None: the id occurs twice, so frames with it are rejected
+        if free is not None:  # None: the column exists, or all names are used
             found.names.append(free)
             found.keys.append(entry.key)
             used.add(free)

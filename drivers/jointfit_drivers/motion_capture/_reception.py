@@ -126,7 +126,7 @@ def content_findings(
     name : str
         Name of the server.
     remedy : str
-        Place in the camera software where the streamed markers and bodies are selected.
+        Instruction for selecting the streamed markers and bodies in the camera software.
     """
     frames = reception.frames
     layout = frames[-1].layout
@@ -148,7 +148,7 @@ def content_findings(
 def tracking_findings(
     settings: MocapSettings, frames: Sequence[MocapFrame], name: str, remedy: str
 ) -> list[Finding]:
-    """Return a finding for each rigid body in rig.toml that no frame contains.
+    """Return a finding for each streamed rigid body of rig.toml that was tracked in no frame.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def tracking_findings(
     name : str
         Name of the server.
     remedy : str
-        Instruction for displaying the definition of a body in the camera software.
+        Instruction for checking the definition of a body in the camera software.
     """
     findings = []
     bodies = frames[-1].layout.bodies
@@ -174,7 +174,7 @@ def tracking_findings(
 
 
 def summary(frames: Sequence[MocapFrame], name: str) -> Finding:
-    """Return a finding that states rate and content of the frames if there is no fault."""
+    """Return the finding for a stream without faults: rate and content of the frames."""
     layout, span_s = frames[-1].layout, (frames[-1].arrival_ns - frames[0].arrival_ns) / 1e9
     rate = f"{(len(frames) - 1) / span_s:.0f} frames a second, " if span_s > 0 else ""
     content = f"{rate}{len(layout.bodies)} rigid bodies, {len(layout.markers)} markers"

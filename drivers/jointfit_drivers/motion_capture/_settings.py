@@ -52,7 +52,9 @@ class ServerSettings(MocapSettings):
         if (address := _address(server)) is not None and (
             address.is_multicast or address.is_unspecified
         ):
-            raise ValueError(f"{server} is the address of no host: expected that of the server")
+            raise ValueError(
+                f"{server} is the address of no host: expected the address of the server"
+            )
         return server
 
     @field_validator("interface")

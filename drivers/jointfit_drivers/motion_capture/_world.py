@@ -55,7 +55,7 @@ def is_near(x: float, y: float, z: float) -> bool:
 
 
 def unit_quaternion(w: float, x: float, y: float, z: float) -> Quaternion | None:
-    """Return the normalized quaternion; None if its norm differs from 1 by `NORM_TOLERANCE`."""
+    """Return the normalized quaternion; None if its norm is not 1 within `NORM_TOLERANCE`."""
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     if not abs(norm - 1.0) <= NORM_TOLERANCE:
         return None

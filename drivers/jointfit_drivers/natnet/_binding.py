@@ -3,13 +3,15 @@
 A labeled marker has the id ``model << 16 | member``. The model is a rigid body, a skeleton or an
 asset. The name of a member is the marker name in the description (bitstream 4.0 and later). Without
 such a name, the member has the name of the marker at the same position in the marker set with the
-model's name. If there is no such set, the names are ``Marker1``, ``Marker2`` and so on. Markers of
-a set without a model are identified by set and position. The set ``all`` is ignored, because it
-repeats the other sets.
+model's name. Without such a set, the markers of a rigid body are named ``Marker1``, ``Marker2`` and
+so on; those of a skeleton have no names and are not used. Markers of a set without a model are
+identified by set and position. The set ``all`` is ignored, because it repeats the other sets.
 
 `jointfit_drivers.motion_capture.bind_columns` defines the names of the columns.
 
-Invariant: the module is pure. Only names matter; ids and orders do not.
+Invariant: the module is pure. A name of a rigid body, or of a marker whose description contains its
+name, selects the same column when the server assigns other ids or lists its models in another
+order.
 """
 
 from __future__ import annotations

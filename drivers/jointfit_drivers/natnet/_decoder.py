@@ -126,7 +126,7 @@ class NatNetDecoder:
         return []
 
     def _take(self, chunk: Chunk, message: natnet.Message, out: list[Decoded]) -> None:
-        """Append the content of one message. Messages of other clients have no content."""
+        """Append the content of one message. Messages of clients have no content."""
         match message:
             case natnet.FrameOfData():
                 self._frame(chunk, message, out)
@@ -272,12 +272,15 @@ class NatNetDecoder:
 
         if self._stamped:
             self._stamped = False
-            text = f"no exposure stamps (USB cameras?): {self._latency_ms:g} ms before transmission"
+            text = (
+                "no exposure stamps (USB cameras?): the exposure is assumed to be "
+                f"{self._latency_ms:g} ms before transmission"
+            )
             out.append(DeviceEvent("warning", text, {"latency_ms": self._latency_ms}))
         return max(0, frame.transmit - round(self._latency_ms * hz / 1000))
 
     def _announce(self, params: int, out: list[Decoded]) -> None:
-        """Append events for flags that are newly set in a frame."""
+        """Append events for flags that are newly set, and for each change of the edit mode."""
         risen, self._announced = params & ~self._announced, params
         out += [DeviceEvent("setting", text) for bit, text in _ANNOUNCED.items() if risen & bit]
 

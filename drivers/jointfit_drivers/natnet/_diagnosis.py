@@ -155,7 +155,7 @@ async def _missing_frames(
         text = f"the server streams bitstream {natnet}, expected {oldest} or newer"
         return [Finding(CHECK, name, "error", text, "update Motive to 1.5 or later")]
     if reception.datagrams or isinstance(failure, DeviceMisconfiguredError):
-        remedy = "restart streaming in Motive; `jointfit decode natnet` shows a capture of it"
+        remedy = "restart streaming in Motive; `jointfit decode natnet` displays a capture"
         text = str(failure) if failure is not None else "frames arrive before the model"
         return [Finding(CHECK, name, "error", text, remedy)]
 

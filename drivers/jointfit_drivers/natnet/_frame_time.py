@@ -40,7 +40,7 @@ class FrameTime:
 
     @property
     def tick_clock(self) -> TickClock | None:
-        """UNIX time in ns; None until its representation in the frames is known."""
+        """Clock of UNIX time in ns; None until the format of the time in the frames is known."""
         return _UNIX if self._precise is not None and self._precise.decided else None
 
     def unix_ns(self, frame: FrameOfData, out: list[Decoded]) -> int | None:

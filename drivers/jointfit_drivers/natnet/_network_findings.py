@@ -71,7 +71,7 @@ def card_findings(
         return [
             Finding(
                 CHECK, name, "note" if arrived else "warning",
-                f"two interfaces reach {host}: {listed}; multicast frames may arrive at the other",
+                f"two interfaces reach {host}: {listed}; multicast frames may arrive at either",
                 f'set interface = "{local}" in [mocap], or disconnect one: '
                 f"sudo ip link set {reaching[-1].name} down",
             )

@@ -68,7 +68,7 @@ class OpenRequests:
             self._asked_ns[kind] = now_ns
 
     def accept(self, datagram: bytes, now_ns: int) -> bool:
-        """Return whether a control datagram answers an open request, or does not need one.
+        """Return whether a control datagram answers an open request, or needs no request.
 
         The first answer closes the request. If the answer is unusable, the caller sends a new
         request.

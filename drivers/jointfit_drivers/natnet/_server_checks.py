@@ -80,7 +80,7 @@ def check_server(name: str, settings: NatNetSettings, info: ServerInfo) -> None:
         )
     if settings.wanted_version not in (None, info.bitstream) and not is_unicast(settings, info):
         raise DeviceMisconfiguredError(
-            f"{found} in multicast, where a client cannot choose: remove bitstream ="
+            f"{found} in multicast, where a client cannot choose it: remove bitstream ="
             f" {settings.bitstream!r}, or switch Motive to unicast"
         )
 
@@ -106,7 +106,7 @@ def check_group(name: str, info: ServerInfo, port: int) -> None:
         )
     if not port:
         raise DeviceMisconfiguredError(
-            f"{name} announces data port 0: set mocap.data_port to the one of Motive (1511)"
+            f"{name} announces data port 0: set mocap.data_port to the data port of Motive (1511)"
         )
 
 

@@ -3,9 +3,9 @@
 1. The session sends CONNECT every 0.5 s until SERVERINFO arrives, which determines the data socket.
 2. It sends REQUEST_MODELDEF every 0.5 s until MODELDEF arrives, because frames cannot be used
    without the model.
-3. It receives frames. It sends ten echo requests at intervals of 50 ms, then one per second. In
-   unicast, it also sends one KEEPALIVE per second. Frames before the tenth echo answer are not
-   synchronized.
+3. It receives frames. It sends ten echo requests at intervals of 50 ms, then one every 0.8 to
+   1.2 s. In unicast, it also sends one KEEPALIVE per second. Frames before the tenth echo answer
+   are not synchronized.
 
 Every accepted datagram is emitted in the order of arrival, so that a replay has the same input. The
 receiver of the chunks decodes the frames. This module reads only their flags. Once per second it
@@ -62,7 +62,7 @@ EVERY_S = 1.0
 """Interval between keep-alive messages, between requests for a changed model, and between checks of
 a whole frame, s."""
 MISFITS = 3
-"""Number of consecutive undecodable frames after which the server is asked for its bitstream
+"""Number of consecutive undecodable frames after which the session requests the bitstream version
 again."""
 
 _PARAMS = struct.Struct("<h")
@@ -121,7 +121,7 @@ class NatNetSession:
                     except OSError as error:
                         text = (
                             f"cannot join {info.group}:{port} ({error.strerror or error}): check "
-                            "the network card and its address, or choose another by interface"
+                            "the network card and its address, or set interface to another card"
                         )
                         raise DeviceLostError(f"{self._name}: {text}") from error
 

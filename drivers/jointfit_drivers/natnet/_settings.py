@@ -21,14 +21,14 @@ class NatNetSettings(ServerSettings):
         None, ge=1, le=65535, description="port of multicast frames; default: as announced"
     )
     bitstream: Literal["3.0", "3.1", "4.0", "4.1", "4.2"] | None = Field(
-        None, description="bitstream to ask a unicast 4.x server for; default: the server's own"
+        None, description="bitstream requested from a unicast 4.x server; default: the server's own"
     )
     latency_ms: float = Field(
         10.0,
         ge=0,
         le=1000,
-        description="from exposure to transmission, for cameras without exposure stamp (USB) "
-        "or on PTP, ms",
+        description="delay from exposure to transmission, for cameras without exposure stamps "
+        "(USB) or with PTP, ms",
     )
     time: Literal["server", "ptp", "utc"] = Field(
         "server",

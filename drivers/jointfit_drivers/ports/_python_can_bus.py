@@ -1,6 +1,7 @@
-"""A CAN bus of any type that python-can supports: SocketCAN, or another type read by a thread.
+"""A CAN bus of any type that python-can supports.
 
-Frames get the kernel's stamp if there is one (SocketCAN), otherwise the time of the read.
+A thread reads the buses that have no file descriptor. Frames of SocketCAN get the kernel's stamp,
+and other frames get the time of the read.
 
 Invariant: no exception of python-can leaves this module. A fault that may end without a change of
 the settings raises `DeviceLostError`. Any other fault raises `DeviceMisconfiguredError`.
@@ -342,7 +343,7 @@ class _Pump:
                     if self._stopped.is_set():
                         return
                 self._call_in_loop(self._accept, now, frames)
-        except Exception as error:  # noqa: BLE001 - handed to whoever awaits the bus
+        except Exception as error:  # noqa: BLE001 - passed to the task that awaits the bus
             if not self._stopped.is_set():
                 self._call_in_loop(self._failed, error)
 

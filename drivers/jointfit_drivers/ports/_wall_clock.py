@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 STEP_NS = 1_000_000
-"""Change of the difference above which it is a step of the wall clock, not slewing, ns."""
+"""Change of the difference above which the wall clock was stepped, not slewed, ns."""
 OLDEST_NS = 2_000_000_000
 """Longest time that a packet waits in a socket that is being read, ns."""
 _READINGS = 5

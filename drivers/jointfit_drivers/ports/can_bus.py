@@ -41,8 +41,8 @@ CanKey = tuple[int, bool]
 """Identifier of a frame, and whether it has 29 bits."""
 
 _UNCLAIMED = 512
-"""Largest number of stored frames without subscriber. Four sensors at 400 Hz send as many frames in
-a third of a second."""
+"""Largest number of stored frames without subscriber. Four sensors that send 400 frames per second
+each fill the store in a third of a second."""
 _CLAIM_NS = 300_000_000
 """Largest age of stored frames that are delivered to a new subscriber, ns. The devices of a rig
 start at almost the same time, so their first frames may arrive before they subscribe."""
@@ -120,7 +120,7 @@ class SharedBus:
         self._seen: dict[CanKey, deque[bytes]] = {}  # last data of unclaimed identifiers
         self._lock = asyncio.Lock()  # opening and closing take time and must not overlap
         self.users = 0
-        """Devices that are subscribed to the bus."""
+        """Number of devices that use the bus."""
         self._subscribers: list[_Subscriber] = []
         self._routes: dict[CanKey, _Subscriber] = {}
         self._ids: dict[str, Mapping[CanKey, str]] = {}
@@ -242,7 +242,7 @@ class SharedBus:
         *,
         worked: bool,
     ) -> str:
-        """Return a text that names the missing identifier of a silent device and the received ones.
+        """Return a text with the missing identifier of a device and the received identifiers.
 
         The text is the same as long as the findings are the same.
         """

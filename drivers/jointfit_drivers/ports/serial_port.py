@@ -1,4 +1,4 @@
-"""Serial ports, which pyserial opens and configures, and the event loop reads and writes.
+"""Serial ports. pyserial opens and configures them; the event loop reads and writes them.
 
 The kernel does not stamp data of a tty. Bytes are stamped with the monotonic clock immediately
 after the read.
@@ -80,7 +80,7 @@ class SerialPort:
     ------
     DeviceLostError
         On entry: the port is absent, in use, or not (yet) permitted. Later: the port is unplugged
-        or silent.
+        or silent, or accepts no bytes.
     DeviceMisconfiguredError
         On entry: the file is not a serial port, or the port does not support the speed.
     """
@@ -232,7 +232,7 @@ class SerialPort:
                 except OSError as error:
                     raise _unplugged_error(path, error.strerror) from error
                 if not data:  # end of file: the system has closed the port
-                    raise _unplugged_error(path, "hang-up")  # noqa: TRY301 - a call costs a tenth of all
+                    raise _unplugged_error(path, "hang-up")  # noqa: TRY301 - a call adds 10 % to the time
 
                 # The stamp must follow the read. A stamp from before the read would be too early
                 # for bytes that arrive while this process is delayed, and clocks are fitted to the

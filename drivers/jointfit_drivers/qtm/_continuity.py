@@ -3,7 +3,7 @@
 Frame numbers are not reliable. They can stay at 1 in live preview, and the real-time rate can be a
 fraction of the camera rate. Losses are counted in units of the usual step of the number.
 
-Invariant: the module is pure. A stamp that decreases by more than reordering can explain is a
+Invariant: the module is pure. A decrease of the stamp that reordering cannot explain shows a
 restart, because the time of each measurement and of each loop of a recording begins at 0.
 """
 
@@ -45,7 +45,7 @@ class TimestampContinuity:
 
     @property
     def began(self) -> bool:
-        """Whether a frame has arrived since the start."""
+        """Whether a frame has arrived since the start or the last call of `forget`."""
         return self._stamp_us is not None
 
     def forget(self) -> None:

@@ -39,7 +39,7 @@ _MISSING_TEXTS = {
     "Project Options, Processing, Real-time actions",
     ComponentType.MARKERS_RESIDUAL: "frames have no labeled markers: in QTM enable 3D tracking and "
     "an AIM model in Project Options, Processing, Real-time actions",
-    ComponentType.TIMECODE: "frames have no timecode, which QTM announces",
+    ComponentType.TIMECODE: "frames lack the timecode that QTM announces",
 }
 _VERSION_ANSWER = "version set to "
 _EVENTS = frozenset(map(int, QtmEvent))
@@ -226,7 +226,7 @@ class QtmDecoder:
             self.unpublished += 1
             self._misfits += 1
             if self._misfits == 1:
-                text = "frames do not fit the settings: waiting for new ones"
+                text = "frames do not fit the settings: waiting for new settings"
                 out.append(DeviceEvent("warning", text))
             return
 

@@ -123,7 +123,7 @@ class QtmSession:
                 port = self._settings.command_port
                 raise DeviceMisconfiguredError(
                     f"{self._name}: this port sends big-endian: set command_port = {port - 1}, the "
-                    "little-endian one (base port of QTM plus 1)"
+                    "little-endian port (base port of QTM plus 1)"
                 )
             else:
                 raise _not_qtm(self._name)
@@ -131,7 +131,7 @@ class QtmSession:
     def _read_udp(self, udp: UdpSocket) -> None:
         try:
             arrivals = udp.receive()
-        except OSError:  # an ICMP refusal is forged: this socket sends nothing
+        except OSError:  # an ICMP refusal is forged, because this socket sends nothing
             return
         for arrival in arrivals:
             if arrival.host == self._route.host and _packet_type(arrival.data) in _DATA_TYPES:

@@ -25,7 +25,7 @@ class QtmSettings(ServerSettings):
         "the frames after it",
     )
     data_port: int | None = Field(
-        None, ge=1, le=65535, description="UDP port of this host for frames; default: any free one"
+        None, ge=1, le=65535, description="UDP port of this host for frames; default: a free port"
     )
     up_axis: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = Field(  # type: ignore[assignment]  # QTM announces its axis
         "auto", description="vertical axis of the stream; `auto`: as QTM announces it"

@@ -52,9 +52,10 @@ class SerialTableImu:
         Raises
         ------
         DeviceLostError
-            The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
+            The port is absent, in use, unplugged, or silent for ``lost_after_s``. A retry may
+            succeed.
         DeviceMisconfiguredError
-            The file is not a serial port, or the received bytes contain no message as the table
+            The file is not a serial port, or the received bytes contain no message that the table
             describes.
         """
         settings = self._settings
@@ -74,7 +75,7 @@ class SerialTableImu:
             if chunk is None:
                 raise DeviceLostError(
                     f"{port.path}: silent for {silence_s:g} s: check power and cable, and that the "
-                    "device sends without being asked"
+                    "device sends without a request"
                 )
             chunks.append(chunk)
             received += len(chunk.data)

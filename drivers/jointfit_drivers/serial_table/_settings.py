@@ -88,7 +88,7 @@ class NumberSettings(Settings):
 
 
 class LengthSettings(NumberSettings):
-    """The length of the frame, in the frame."""
+    """Field of the frame that contains the length of the frame."""
 
     adds: int = Field(0, description="size of the whole frame minus this number, bytes")
     longest: int = Field(
@@ -97,7 +97,7 @@ class LengthSettings(NumberSettings):
 
 
 class MessageSettings(NumberSettings):
-    """The type of the frame, in the frame."""
+    """Field of the frame that contains the type of the frame."""
 
     equals: int = Field(
         description="value of the type in frames with measurements; other frames are skipped"
@@ -268,7 +268,10 @@ class SerialTableSettings(SerialImuSettings, TableImuSettings):
                 continue
             place = number.place(self.byte_order)
             if place is None:
-                yield f"frame.{key}.type", f"{number.type!r} is no integer: expected u8, u16 or so"
+                yield (
+                    f"frame.{key}.type",
+                    f"{number.type!r} is no integer: expected u1 to u64 or i2 to i64",
+                )
                 return
             others[f"frame.{key}"] = place
 

@@ -6,9 +6,9 @@ is the measured sample period:
 | finding                                                  | outcome                          |
 |----------------------------------------------------------|----------------------------------|
 | c = round(d / P) within 1 % and two counts               | same clock; c - 1 samples lost   |
-| no counter; d is positive, and it is either short or     | same clock; round(d / P) - 1     |
+| no counter; d is not negative, and it is either short or | same clock; round(d / P) - 1     |
 | equal to the step of the arrival times                   | samples lost                     |
-| no time; c is positive                                   | c - 1 samples lost               |
+| no time; c is not negative, and it is plausible          | c - 1 samples lost               |
 | none of the above                                        | the sample is held               |
 | the next sample continues the held one                   | the device restarted             |
 | the next sample continues the last accepted one          | the held one was corrupt         |

@@ -51,7 +51,7 @@ class FieldSettings(Settings):
     )
     type: str | None = Field(
         None,
-        description="u8 to u64, i8 to i64 (any number of bits), f16, f32 or f64",
+        description="u1 to u64, i2 to i64 (any number of bits), f16, f32 or f64",
         examples=["i16"],
     )
     byte_order: Literal["little", "big"] | None = Field(
@@ -71,7 +71,8 @@ class FieldSettings(Settings):
         None,
         gt=1,
         description="for time and counter: number of values before they begin at 0 again; "
-        "default: all values of the type",
+        "default: all values of an integer type; in text lines 2^32 for a time in us or ms; "
+        "otherwise none",
     )
     mask: int | None = Field(None, gt=0, description="for valid: bits that are evaluated")
     equals: int | None = Field(
@@ -111,7 +112,7 @@ class ChecksumSettings(Settings):
     )
     byte_order: Literal["little", "big"] | None = Field(
         None,
-        description="default: `byte_order` of the table; for fletcher16, little: plain sum first",
+        description="default: `byte_order` of the table; `little` for fletcher16: plain sum first",
     )
     polynomial: int | None = Field(
         None,

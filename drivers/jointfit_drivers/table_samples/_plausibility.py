@@ -32,7 +32,7 @@ _TIMED = 200
 _TIMED_NS = 2_000_000_000
 """Shortest time between arrivals over which the unit of device time is checked, ns."""
 _FASTEST = 1.5
-"""Ratio of device time to host time, or its inverse, from which the unit is wrong."""
+"""Largest ratio of device time to host time, or its inverse, with a correct unit."""
 
 _Sample = tuple[tuple[bytes, ...], tuple[float, ...], tuple[float, ...]]
 
@@ -154,7 +154,7 @@ class PlausibilityChecks:
         if check.slope is None:
             return []
 
-        text = f"rates explain {check.slope:.3g} times the rotation of gravity, expected 1"
+        text = f"gravity rotates {check.slope:.3g} times as fast as the rates predict, expected 1"
         unit = check.fitting_unit(self._form.rate_unit)
         remedy = "check unit, scale and axes of `fields.rate`"
         if unit is not None:

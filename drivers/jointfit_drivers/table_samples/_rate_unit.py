@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Vector
 
 _STEPS = 300
-"""Number of steps after which the slope is computed for the first time."""
+"""Number of steps between two computations of the slope."""
 _MOST_STEPS = 6000
 """Number of steps after which the check ends if the sensor hardly rotated."""
 _EXPLAINED = 0.5
@@ -58,8 +58,8 @@ class RateUnitCheck:
         if last is None or not 0 < t_ns - last[0] <= _LONGEST_S * 1e9:
             return
 
-        # The mean rate of two readings is used, because a rate may refer to its stamp or to the
-        # time before.
+        # The mean rate of two readings is used, because a rate may refer to the instant of its
+        # stamp or to the interval before it.
         step_s = 0.5e-9 * (t_ns - last[0])
         wx, wy, wz = ((now + then) * step_s for now, then in zip(rate, last[1], strict=True))
         bx, by, bz = last[2]

@@ -92,7 +92,7 @@ class RecordSamples(Refusals):
             self._is_reported = self._is_reported or bool(findings)
             self._checks = None if self._checks.done else self._checks
         if self._valid is not None and not self._is_valid(values[self._valid]):
-            return [*out, self.refuse(record.size, "the device reports it as invalid")]
+            return [*out, self.refuse(record.size, "the device marks the sample as invalid")]
 
         if ticks is None and counter is None:
             return out + self._sample(record, ticks, counter)
@@ -160,7 +160,7 @@ class RecordSamples(Refusals):
         if q is None:
             if (
                 self.refused >= self._recheck and not self._is_reported
-            ):  # the first samples passed by chance
+            ):  # the first checks may have passed by chance
                 self._recheck *= 10
                 self._checks = PlausibilityChecks(form, self._places)
             return [self.refuse(record.size, "quaternion norm is not 1")]
@@ -175,7 +175,7 @@ class RecordSamples(Refusals):
         self, raw: RawSamples, record: TableRecord, si: tuple[float, ...], stamp: RawStamp
     ) -> list[Decoded]:
         """Return samples for which the gateway computes the orientation."""
-        # Without device time, the filter uses the kernel's stamps.
+        # Without device time, the filter uses the arrivals.
         clock = self.tick_clock
         if clock is None:
             now, passed_ns = record.arrival_ns, float(record.arrival_ns - self._raw_at)
@@ -229,7 +229,7 @@ class RecordSamples(Refusals):
             return None
 
     def _is_valid(self, raw: float | None) -> bool:
-        """Return whether the device marked the sample as valid; a missing mark counts as valid."""
+        """Return whether the device marked the sample as valid; a missing mark counts as 1."""
         try:
             bits = 1 if raw is None else int(raw) & self._form.mask
         except (ValueError, OverflowError):

@@ -108,7 +108,7 @@ def place_fields(
             x for x, slot in zip(letters, SLOTS[name], strict=True) if slot not in form.fields
         ]
         if missing and not any(key.startswith(f"fields.{name}") for key, _ in form.faults):
-            text = f"component {', '.join(missing)} has no place: add it to `order`"
+            text = f"component {', '.join(missing)} is missing: add it to `order`"
             form.faults.append((f"fields.{name}", text))
     if not any(slot < MEASURED for slot in form.fields) and not form.faults:
         form.faults.append(("fields", "expected a quaternion, or rate and acceleration"))
@@ -137,7 +137,7 @@ def binary_place(
     kind, bits = parsed
     if isinstance(part.offset, tuple):
         if len(part.offset) != count:
-            text = f"{len(part.offset)} offsets for {count} components: expected one of each"
+            text = f"{len(part.offset)} offsets for {count} components: expected one each"
             raise FieldFaultError("offset", text)
         first = [8 * offset + part.bit for offset in part.offset]
     else:

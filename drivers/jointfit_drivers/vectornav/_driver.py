@@ -48,7 +48,8 @@ class VectorNavImu:
         Raises
         ------
         DeviceLostError
-            The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
+            The port is absent, in use, unplugged, or silent for ``lost_after_s``. A retry may
+            succeed.
         DeviceMisconfiguredError
             The file is not a serial port, or no VectorNav device answers. Or the device uses
             another speed, or cannot send the orientation at this rate.

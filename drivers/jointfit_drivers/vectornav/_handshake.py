@@ -3,7 +3,8 @@
 The driver reads registers, and writes only registers that differ. Written values are volatile:
 without ``persist``, the device returns to its stored values at the next power-up. A fault that may
 end without a change of the settings raises `DeviceLostError`. All other faults raise
-`DeviceMisconfiguredError`, and the device streams as before.
+`DeviceMisconfiguredError`. The driver then requests the device to resume; registers that were
+already written keep their new values until the next power-up.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ _REPLY_S, _STORE_S = 0.5, 3.0
 """Longest wait for a reply, and until all registers are stored, s."""
 _IMU_RATES = {"VN-3": 400}
 _IMU_RATE = 800
-"""Rates of the IMU, Hz: for models whose name begins with a key of the table, and for others."""
+"""Rates of the IMU, Hz: for models whose name contains a key of the table, and for others."""
 
 
 class VectorNavHandshake:
@@ -98,7 +99,7 @@ class VectorNavHandshake:
 
         try:
             await self._configure()
-        except DeviceMisconfiguredError:  # the device streams as before
+        except DeviceMisconfiguredError:  # resume; registers that were written remain
             await self._ask("VNASY,1", tries=1)
             raise
         self._refuse(await self._answer("VNASY,1"), "refuses to stream")

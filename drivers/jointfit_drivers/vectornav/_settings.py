@@ -30,8 +30,8 @@ class VectorNavSettings(GatewaySettings, SerialImuSettings):
     )
     direction: Literal["sensor_to_world", "world_to_sensor"] = SettingsField(
         "sensor_to_world",
-        description="whether the quaternion maps sensor to world coordinates (the manual), or the "
-        "reverse; see the check in docs/devices.md",
+        description="whether the quaternion maps sensor to world coordinates (as in the manual), "
+        "or the reverse; see the check in docs/devices.md",
     )
 
     @property

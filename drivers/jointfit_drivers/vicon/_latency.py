@@ -1,7 +1,7 @@
 """Delay from exposure to arrival, as far as the server announces this delay.
 
 The server sends neither the time of exposure nor a clock. LatencyInfo contains the durations of the
-processing stages, and a ping limits the delay of the network.
+processing stages, and the round-trip time of a ping is an upper bound of the network delay.
 
 Invariant: the module is pure.
 """

@@ -2,7 +2,7 @@
 
 A subject that is not visible has no object. Positions are in millimetres, and rotation matrices in
 row-major order. If there are no global poses, the light-weight poses are used. They are relative to
-the parent segment, so a segment without a visible parent counts as missing.
+the parent segment, so a segment whose parent is not visible counts as missing.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ class ViconColumns(NamedTuple):
     body_positions: Array
     body_orientations: Array
     suspicious: int
-    """Number of segments that have a position but no valid rotation."""
+    """Number of segments rejected because of an invalid rotation. For light-weight poses, an
+    implausible position also counts."""
     unknown: int
     """Number of markers and segments that belong to no subject."""
 

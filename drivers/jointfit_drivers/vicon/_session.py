@@ -3,7 +3,7 @@
 1. The server sends the ids of the objects that it offers. The driver answers with the ids that it
    requires.
 2. The driver sends RequestFrame, and frames follow.
-3. The driver sends one ping per second. Its round-trip time limits the delay of the network.
+3. The driver sends one ping per second. Its round-trip time is an upper bound of the network delay.
 
 Every packet is emitted in the order of arrival, so that a replay has the same input.
 """

@@ -1,8 +1,8 @@
 """Decoder of VRPN servers: converts messages to optical frames.
 
 The poses of one instant form a frame (`FrameAssembler`). The name of a body is the name of its
-tracker. The name is known when the server has described the tracker, or has sent its first report.
-Names in rig.toml that are still unknown after half a second are reported.
+tracker. The name is known when the server has described the tracker. Earlier reports of the tracker
+are dropped. Names in rig.toml that are still unknown after half a second are reported.
 
 Invariant: the output depends only on the chunks fed. The decoder reads no clock and no socket.
 """
@@ -84,7 +84,8 @@ class VrpnDecoder:
         self._delay = BacklogDelay()
         self._named_unknown: set[int] = set()
         self.unknown_ids = 0
-        """Number of reports dropped because the server has not described their sender."""
+        """Number of reports dropped because the server has not described their sender, or has too
+        many bodies."""
         self.suspicious = 0
         """Number of poses rejected because of implausible numbers."""
 
@@ -123,8 +124,7 @@ class VrpnDecoder:
                 case CorruptBytes():
                     out.append(Corrupt(message.discarded, message.reason))
                 case vrpn.Cookie():
-                    # The recording contains another connection, so the state of the server is
-                    # discarded.
+                    # A new connection begins, so the state of the server is discarded.
                     version = f"{message.major:02d}.{message.minor:02d}"
                     out.append(DeviceEvent("info", f"VRPN {version}", {"vrpn": version}))
                     if message.major != vrpn.MAJOR:

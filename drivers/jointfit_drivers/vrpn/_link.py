@@ -96,7 +96,7 @@ class VrpnLink(SocketLink):
     def _read_udp(self, udp: UdpSocket, host: str) -> None:
         try:
             arrivals = udp.receive()
-        except ConnectionRefusedError:  # forged: this socket sends nothing
+        except ConnectionRefusedError:  # forged, because this socket sends nothing
             return
         except OSError as error:
             raise self._lost_error(error) from error

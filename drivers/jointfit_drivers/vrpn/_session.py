@@ -1,11 +1,12 @@
 """One connection to a VRPN server, from the cookie to silence.
 
 1. The session opens a TCP connection to the server. In the classic form, it announces itself by UDP
-   every 2 s until the server connects back.
+   twice, 2 s apart, and the server connects back.
 2. Both sides send a cookie that contains their version. Other major versions are refused.
 3. With ``transport = "udp"``, the session sends the UDP port for poses.
-4. Poses follow. Before the server counts as silent, the session requests an answer once per second.
-   The error message can then name the cause: no server, or no visible body.
+4. Poses follow. After half of `silence_s` without a pose, the session requests answers, at
+   intervals of at most 1 s. The error message can then name the cause: no server, or no visible
+   body.
 
 Invariant: every chunk is emitted in the order of arrival, so that a replay has the same input.
 """
@@ -137,6 +138,8 @@ class VrpnSession:
 
         Raises
         ------
+        DeviceLostError
+            The server sends nothing.
         DeviceMisconfiguredError
             The answering program is not a VRPN server, or its major version differs.
         """

@@ -94,7 +94,7 @@ class WitMotionDecoder:
         self._newer = NewerFirmwareDetector(tool="the WitMotion software")
         self._calendar = CalendarTime()
         self._first_ns = 0
-        self._ticks: int | None = None  # of the present sample
+        self._ticks: int | None = None  # time of the current sample
         self._force: bytes | None = None
         self._rate: bytes | None = None
         self._refused = 0

@@ -49,7 +49,8 @@ class WitMotionImu:
         Raises
         ------
         DeviceLostError
-            The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
+            The port is absent, in use, unplugged, or silent for ``lost_after_s``. A retry may
+            succeed.
         DeviceMisconfiguredError
             The file is not a serial port, or no WitMotion device answers. Or the device uses
             another speed, or does not send the required frames even on request.

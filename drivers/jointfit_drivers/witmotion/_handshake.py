@@ -1,8 +1,9 @@
 """Start of a WitMotion device: the driver requests the required frames, or raises an error.
 
 The device does not acknowledge writes. The driver first listens, and reads the settings if the
-firmware answers. It writes only settings that differ, and listens again. The written registers are
-lost at power-off. The driver writes the flash memory only if ``persist`` permits it.
+firmware answers. If content or rate differ, it writes both, and listens again. The written
+registers are lost at power-off. The driver writes the flash memory, or changes the speed of the
+device, only if ``persist`` permits it.
 
 Source: protocol pages of the vendor. The unlock command permits access for 10 s, and commands must
 be separated by 100 ms.
@@ -97,7 +98,7 @@ class WitMotionHandshake:
         Raises
         ------
         DeviceLostError
-            The device is silent or unplugged.
+            The device is silent or unplugged, or stopped sending after its settings were written.
         DeviceMisconfiguredError
             The device uses another speed, is of another kind or variant, or does not send the
             frames even on request.

@@ -20,24 +20,25 @@ class WitMotionSettings(SerialImuSettings, GatewaySettings):
 
     world: Literal["ENU", "NED", "NWU"] = Field(
         "ENU",
-        description="directions of the x, y and z axis of its world: E east, N north, W west, U "
-        "up, D down; the vendor does not document it, `jointfit probe --physical-test` determines "
-        "it",
+        description="directions of the x, y and z axis of the device's world: E east, N north, W "
+        "west, U up, D down; the vendor does not document them, `jointfit probe --physical-test` "
+        "determines them",
     )
     direction: Literal["sensor_to_world", "world_to_sensor"] = Field(
         "sensor_to_world",
-        description="whether its quaternion maps sensor to world coordinates, or the reverse; the "
-        "vendor does not document it, `jointfit probe --physical-test` determines it",
+        description="whether the device's quaternion maps sensor to world coordinates, or the "
+        "reverse; the vendor does not document the direction, `jointfit probe --physical-test` "
+        "determines it",
     )
     device_time: bool = Field(
         False,
-        description="use the calendar time of the device, which it sends with every sample; "
-        "default: arrival",
+        description="stamp samples with the calendar time that the device sends with every "
+        "sample; default: time of arrival",
     )
     persist: bool = Field(
         False,
-        description="store changed settings in the device's flash; also allows the change of its "
-        "speed to `baud`",
+        description="store changed settings in the device's flash; also permits the driver "
+        "to change the device's line speed to `baud`",
     )
 
     @property

@@ -14,8 +14,8 @@ _MOST_OTHERS = 64
 """Number of consecutive messages of other devices after which the selected device counts as absent.
 No line has that many devices."""
 _SIGHTINGS = 10
-"""Number of messages of other devices after which they are reported. Single corrupt messages may
-pass the checksum."""
+"""Number of messages of other devices after which an event reports these devices. The checksum may
+accept single corrupt messages."""
 
 
 class BusIdSelection:
@@ -45,7 +45,7 @@ class BusIdSelection:
         return False
 
     def report(self, bus_id: int) -> list[DeviceEvent]:
-        """Return a warning, once, about measurements whose `bus_id` is not the selected one."""
+        """Return, once, an event about measurements whose `bus_id` is not the selected one."""
         self._sightings += 1
         if self._sightings != _SIGHTINGS or self._selected is None:
             return []
@@ -54,7 +54,7 @@ class BusIdSelection:
             return [DeviceEvent("info", text, {"bus_id": bus_id})]
         text = (
             f"measurements with bus id {bus_id} arrive, too: several devices send on this line. "
-            f"Only those of bus id {self._selected} are used: connect each device to a port of its "
-            "own, without an Xbus master, or select another device of a capture with `bus_id`"
+            f"Only measurements of bus id {self._selected} are used. Connect each device to a port "
+            "of its own, without an Xbus master. In a capture, select the device with `bus_id`"
         )
         return [DeviceEvent("warning", text, {"bus_ids": sorted((self._selected, bus_id))})]

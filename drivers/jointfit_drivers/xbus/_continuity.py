@@ -10,10 +10,10 @@ another clock (GNSS).
 | follows the last accepted orientation         | accepted; skipped counter values were lost      |
 | does not follow                               | held until the next orientation                 |
 | the next follows the last accepted one        | the held one is corrupt and is dropped          |
-| the next follows the held one                 | both accepted; a restart if device time jumped  |
-|                                               | but neither counter nor arrival time did, and   |
-|                                               | no backlog explains it; a counter jump if time  |
-|                                               | advanced by one period                          |
+| the next follows the held one                 | both accepted; a restart if device time agrees  |
+|                                               | neither with the counter nor with the arrivals, |
+|                                               | and no backlog explains it; a counter jump if   |
+|                                               | time advanced by one period                     |
 | the next follows neither                      | the held one is dropped, the next one is held   |
 
 The eight-bit checksum accepts one corrupt message in 256, so a single message proves neither a loss
@@ -179,8 +179,8 @@ class XbusContinuity:
             return XbusStep(_lost_count(last, held) + max(turns, 0) * _COUNTS)
         if plausible and (counts is None or ticks <= _GAP * self._period):
             return XbusStep(counter_jumped=counts is not None)
-        # Some bits of a message may be corrupt, or a backlog may have ended. It is a restart only
-        # if device time also disagrees with the arrival times.
+        # Some bits of a message may be corrupt, or a backlog may have ended. The device restarted
+        # only if device time also disagrees with the arrival times.
         elapsed_ns = held.arrival_ns - last.arrival_ns
         delay_ns = self._delay.limit(_PACE_NS, _LATEST_NS)
         continued = device_continued(delay_ns, ticks * TICK_NS, elapsed_ns, _PACE_NS)

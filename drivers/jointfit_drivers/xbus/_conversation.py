@@ -62,8 +62,8 @@ class XbusConversation:
         self.reply_s = REPLY_S
         """Current wait for a reply, s. It is longer for a device that acknowledged late."""
         self.understood = 0
-        """Number of received messages that only an Xbus device sends, because noise may pass a
-        checksum."""
+        """Number of received messages that only an Xbus device sends. Other messages may be noise
+        that passed the checksum."""
 
     def reset(self) -> None:
         """Discard received bytes, here and in the port, for another speed or a new start."""

@@ -100,7 +100,8 @@ class XbusDecoder:
     legacy : LegacyMeasurements, optional
         Fields of MTData messages; None for a device that sends MTData2 messages.
     bus_id : int, optional
-        Bus id of the device whose measurements are used; None: that of the first measurement.
+        Bus id of the device whose measurements are used. None selects the device that sends the
+        first measurement.
     """
 
     def __init__(
@@ -119,7 +120,8 @@ class XbusDecoder:
         self._other_format_reported = False
         self._wanted = {*_WANTED, *self._wires, *(RAW if raw is not None else ())}
         self._layouts: dict[int, MTData2Layout | None] = {}
-        """Layout of the first MTData2 message of each length. A device sends one or two lengths."""
+        """Layout of the MTData2 messages of each length; None if there is no layout. A device sends
+        one or two lengths."""
         self._xbus = XbusCodec()
         self._bus_ids = BusIdSelection(bus_id)
         self._byte_ns = 0.0 if baud is None else _BITS * 1e9 / baud

@@ -54,7 +54,8 @@ class XbusImu:
         Raises
         ------
         DeviceLostError
-            The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
+            The port is absent, in use, unplugged, or silent for ``lost_after_s``. A retry may
+            succeed.
         DeviceMisconfiguredError
             The file is not a serial port, or no Xbus device answers. Or the device uses another
             speed, or its output configuration differs while ``persist`` is false.

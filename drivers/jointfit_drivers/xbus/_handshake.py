@@ -34,8 +34,8 @@ LINE_SPEEDS = (921_600, 115_200, 460_800, 230_400, 2_000_000, 57_600, 38_400, 19
 _LISTEN_S = 0.15
 """Duration of the search at each speed, s. An acknowledgement takes 10 ms at 9600 baud."""
 _QUIET_S = 1.2
-"""Time without a byte after which the bytes before were noise, s. Other devices may send once a
-second."""
+"""If no byte arrives for this time, the earlier bytes were noise, s. Devices of other kinds may
+send only once a second."""
 _RESETS, _RESET_WAIT_S = 50, 0.1
 """Number of requests after a reset, and the interval between them, s. An MTi-G-700 that had not
 answered before replied 1.8 s after its reset."""
@@ -44,8 +44,8 @@ _FRAMES = (0, 1)
 _UNKNOWN_MESSAGE = b"\x04"
 """Error code that a device sends for an unknown message."""
 _RATE_SHARE = 0.01
-"""Largest relative difference between the rate of an older device and `rate_hz`, because periods
-are rounded."""
+"""Largest accepted relative difference between the rate of an older device and `rate_hz`. The
+device rounds its sample period."""
 _NO_SYNC = bytes(12)
 """Entry for a sync function that is off. A request without data would only read the settings."""
 
@@ -158,8 +158,8 @@ class XbusHandshake:
         reply = await self._answer(XbusMessageId.OUTPUT_CONFIGURATION)
         if reply.mid == XbusMessageId.ERROR and reply.data[:1] == _UNKNOWN_MESSAGE:
             raise DeviceMisconfiguredError(
-                f"{self._path}: does not know output configurations, as older devices: set format ="
-                ' "mtdata"'
+                f"{self._path}: does not support output configurations, like older devices: set "
+                'format = "mtdata"'
             )
         found = _outputs_of(reply)
         faults = output_differences(found, rate, self._triggers, self._needs)

@@ -1,8 +1,8 @@
 """Computation of the orientation on the gateway, from the raw measurements of an Xbus device.
 
 The angular rate is sent as RateOfTurn or DeltaQ, and the specific force as Acceleration or DeltaV,
-all in sensor axes. The increments DeltaQ and DeltaV are divided by the mean interval of the device
-clock. When the filter has settled, every complete message yields one sample.
+all in sensor axes. The increments DeltaQ and DeltaV are divided by the mean interval of the samples
+in device time. When the filter has settled, every complete message yields one sample.
 
 Invariant: the output depends only on the messages fed. The module reads no clock and no port.
 """

@@ -9,8 +9,8 @@ SampleTime per group:
 | c = round(d / P) within 1 % and a few counts            | same clock; c - 1 groups were lost  |
 | no counter, d forward by a few P                        | same clock; round(d / P) - 1 lost   |
 | d or c backward, only one of them 0, or disagreement    | contradiction: the group is held    |
-| the next group continues the held one                   | restart, unless time continued,     |
-|                                                         | advanced as the host's did, or      |
+| the next group continues the held one                   | restart, unless SampleTime          |
+|                                                         | continued or followed host time, or |
 |                                                         | a backlog ended                     |
 | the next group continues the last accepted one          | the held one was corrupt            |
 | three contradictions that continue each other, or       | two sensors share the identifiers   |

@@ -78,7 +78,7 @@ class XcdiDecoder:
 
     @property
     def discarded_bytes(self) -> int:
-        """Number of bytes in rejected records and in lines that an adapter lost."""
+        """Number of bytes in rejected records, and on an adapter's line that formed no frame."""
         return self._bus.discarded_bytes
 
     def feed(self, chunk: Chunk) -> list[Decoded]:

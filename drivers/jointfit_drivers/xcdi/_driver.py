@@ -100,11 +100,12 @@ class XcdiSettings(CanImuSettings):
 
     ids: XcdiIdSettings = Field(
         default_factory=XcdiIdSettings,
-        description="its identifiers; necessary if another sensor on the bus has the same ones",
+        description="identifiers of the sensor; necessary if another sensor on the bus has the "
+        "same identifiers",
     )
     extended_ids: bool = Field(
         False,
-        description="29-bit identifiers even where the numbers would fit 11 bits",
+        description="29-bit identifiers even if the numbers fit 11 bits",
     )
     sample_time_unit: Literal["auto", "100us", "1us"] = Field(
         "auto",

@@ -18,8 +18,9 @@ the limit.
 | rotation after the held one                   | advance like the arrival times                   |
 | the next is neither                           | the held one is dropped, the next one is held    |
 
-Invariant: the result depends only on the values fed, and every input is accepted. A motion within
-the range of the gyroscope is delayed by at most one message, and never dropped twice in a row.
+Invariant: the result depends only on the values fed, and every input is accepted. During a motion
+within the range of the gyroscope, a message is delayed by at most one message, and two successive
+messages are never dropped.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ REPLY_S = 0.5
 TRIES = 3
 """Number of times that a command is sent. The x-IMU3 GUI also sends it three times."""
 _CERTAIN = 3
-"""Number of messages with numbers that identify the protocol. A single message may be noise."""
+"""Number of measurement messages that identify the protocol. A single message may be noise."""
 
 
 class XImu3Conversation:

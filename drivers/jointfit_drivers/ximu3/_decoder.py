@@ -214,7 +214,7 @@ class XImu3Decoder(SerialMessageDecoder[XImu3Data | XImu3Reply]):
         if abs(message.ticks - self._last_ticks) > _OLD_PULSE_US:
             return [
                 self._refusals.refuse(
-                    message.size, "time of an edge far from that of the measurements"
+                    message.size, "time of an edge is far from the time of the measurements"
                 )
             ]
         return [SyncPulse(self._arrival_of(message), message.ticks, wire)]

@@ -41,10 +41,12 @@ class XImu3Imu:
         Raises
         ------
         DeviceLostError
-            The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
+            The port is absent, in use, unplugged, or silent for ``lost_after_s``. A retry may
+            succeed.
         DeviceMisconfiguredError
             The file is not a serial port, or no x-IMU3 answers. Or the device uses another speed,
-            or its settings differ while ``persist`` is false.
+            or its settings differ while ``persist`` is false. Or, with ``passive``, the device
+            sends only other messages.
         """
         settings = self._settings
 

@@ -48,7 +48,8 @@ class XImu3Handshake:
     settings : XImu3Settings
         Table of the device in rig.toml.
     hunt : bool
-        Whether to search for a silent device at other speeds.
+        Whether to search for a silent device at other speeds. If the device's bytes cannot be
+        decoded, the other speeds are always searched.
     """
 
     def __init__(
@@ -175,7 +176,7 @@ class XImu3Handshake:
             )
         raise DeviceMisconfiguredError(
             f"{self._path}: the device on this port is not an x-IMU3: it sends bytes, none of them "
-            "its messages at any common speed: correct `port` or `driver`, which "
+            "its messages at a common speed: correct `port` or `driver`, which "
             "`jointfit probe` recognizes"
         )
 

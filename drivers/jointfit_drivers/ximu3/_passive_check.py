@@ -34,6 +34,7 @@ async def ensure_expected_messages(
         measurement.
     """
     codec, kinds = XImu3Codec(), Counter[str]()
+    on_gateway, sends_other = settings.orientation == "gateway", False
     loop = asyncio.get_running_loop()
     until = loop.time() + _LISTEN_S
 
@@ -48,25 +49,24 @@ async def ensure_expected_messages(
             if not isinstance(message, XImu3Data):
                 continue
             kinds[message.kind] += 1
-            if settings.orientation == "gateway":
-                expected = message.kind == DataKind.INERTIAL
-            else:
-                expected = is_orientation(message)
-            if expected:
+            inertial, oriented = message.kind == DataKind.INERTIAL, is_orientation(message)
+            if inertial if on_gateway else oriented:
                 return
+            sends_other |= inertial or oriented
 
     if not kinds:
         raise DeviceMisconfiguredError(
             f"{settings.port}: {codec.fed} bytes at {settings.baud} baud, none of them messages of "
             "an x-IMU3: correct `baud`, `port` or `driver`"
         )
-    needs = "I (inertial)" if settings.orientation == "gateway" else "Q, R or A (orientation)"
-    other = (
-        'orientation = "gateway"'
-        if DataKind.INERTIAL in kinds
-        else "ahrs_message_type = 0 in the device"
-    )
+    if on_gateway:
+        needs, other, key = "I (inertial)", "device", "inertial_message_rate_divisor"
+    else:
+        needs, other = "Q, R or A (orientation)", "gateway"
+        key = "ahrs_message_type to 0 and ahrs_message_rate_divisor"
+    choice = f'orientation = "{other}", or ' if sends_other else ""
     sent = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
     raise DeviceMisconfiguredError(
-        f"{settings.port}: sends messages {sent}, expected {needs}: set {other}"
+        f"{settings.port}: sends messages {sent}, expected {needs}: set {choice}in the device "
+        f"{key} to 400 divided by rate_hz"
     )

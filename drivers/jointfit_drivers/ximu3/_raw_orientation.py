@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from jointfit_drivers.gateway_orientation import RawSamples
     from jointfit_protocols.ximu3 import XImu3Data
 
-"""Unit of the specific force, m/s²."""
 _DEGREE = radians(1.0)
 _OLDEST_US = 1_000_000
 """Age above which a field is not used, us, because the magnetometer was switched off."""

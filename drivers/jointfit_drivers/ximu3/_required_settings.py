@@ -74,7 +74,7 @@ def differences(
         key: f"{key} is {describe_value(key, found.get(key))}, expected "
         f"{describe_value(key, values[0])}"
         for key, values in required
-        # equal and of one JSON type: 1 is not true
+        # Both the value and its JSON type must be equal, because 1 == True in Python.
         if not any(
             found.get(key) == value and isinstance(found.get(key), bool) == isinstance(value, bool)
             for value in values

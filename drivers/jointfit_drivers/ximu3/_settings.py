@@ -48,9 +48,9 @@ class XImu3Settings(GatewaySettings, SerialImuSettings):
         description="required `ahrs_ignore_magnetometer` of the device; default: any, reported",
     )
     sync_wire: int | None = Field(
-        None, ge=0, description="number of the sync wire of the rig at its accessory's sync input"
+        None, ge=0, description="number of the rig's sync wire at the sync input of the accessory"
     )
-    sync_edge: Literal["rising", "falling"] = Field("rising", description="edge that counts")
+    sync_edge: Literal["rising", "falling"] = Field("rising", description="edge that is used")
 
     @property
     @override
@@ -79,7 +79,7 @@ class XImu3Settings(GatewaySettings, SerialImuSettings):
             }
             for key, value in checked.items():
                 if value is not None:
-                    yield key, "a passive driver sends nothing: remove the key, or passive"
+                    yield key, "a passive driver sends nothing: remove this key or `passive`"
 
 
 def rate_divisor(rate_hz: float) -> int | None:

@@ -106,7 +106,7 @@ class HubReport(NamedTuple):
     status: int
     """Status of the report; bits 0 and 1 are the accuracy."""
     delay: int
-    """Time from the base to the measurement, 100 us."""
+    """Time from the base to the measurement, in units of 100 us."""
     values: tuple[float, ...]
     """Measured values in SI units, in the order of the table at the top of this module."""
 
@@ -181,7 +181,7 @@ def encode_report(report: HubReport) -> bytes:
 
 
 def base_time(report: bytes) -> int | None:
-    """Return the shift of the base by a report FB or FA, 100 us; None for other reports."""
+    """Return the shift of the base by a report FB or FA, in units of 100 us, or None."""
     if report[0] not in {HubReportId.BASE_TIME, HubReportId.TIME_REBASE}:
         return None
     kind, value = _BASE.unpack(report)

@@ -86,7 +86,7 @@ def encode_shtp(channel: int, sequence: int, payload: bytes) -> bytes:
         `payload` is longer than `MOST_PAYLOAD`.
     """
     if len(payload) > MOST_PAYLOAD:
-        raise ValueError(f"{len(payload)} bytes: an SHTP packet holds {MOST_PAYLOAD}")
+        raise ValueError(f"{len(payload)} bytes: an SHTP packet holds at most {MOST_PAYLOAD}")
     header = _HEADER.pack(len(payload) + _HEADER.size, channel, sequence & 0xFF)
     return _encode_frame(_SHTP, header + payload)
 

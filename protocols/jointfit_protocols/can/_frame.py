@@ -84,9 +84,9 @@ def pack_frames(frames: Iterable[CanFrame]) -> bytes:
 def unpack_frames(data: bytes) -> list[CanFrame | CorruptBytes]:
     """Return the frames that the records in `data` contain; any bytes are accepted.
 
-    A record that `pack_frames` cannot have written becomes 24 corrupt bytes, and unpacking
-    continues with the next record. An incomplete last record is corrupt as well, because chunks
-    contain only complete records.
+    A record with a size above 8, an unknown flag, or an identifier out of range becomes 24 corrupt
+    bytes, and unpacking continues with the next record. An incomplete last record is corrupt as
+    well, because chunks contain only complete records.
     """
     found: list[CanFrame | CorruptBytes] = []
     whole = len(data) - len(data) % RECORD_BYTES

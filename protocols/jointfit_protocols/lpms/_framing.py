@@ -4,9 +4,9 @@
     | 3A | id  | command | n   | data ... | LRC      | 0D  | 0A  |      n <= 1024
 
 Numbers are little-endian. LRC is the 16-bit sum of identifier, command, n and data. The vendor's
-documents permit two interpretations: the sum of the bytes, or the sum of 16-bit words in the head.
-Both sums are equal while identifier, command and n are below 256. The codec accepts both, and sends
-the sum of the bytes.
+documents permit two interpretations: the sum of all bytes, or the sum of the 16-bit words of the
+head and the bytes of the data. Both sums are equal while identifier, command and n are below 256.
+The codec accepts both, and sends the sum of the bytes.
 
 Source: protocol pages of the vendor's knowledge base; OpenZen (MIT) for the two sums.
 
@@ -62,7 +62,7 @@ def encode(command: int, data: bytes = b"", sensor_id: int = 1) -> bytes:
         `data` is longer than 1024 bytes, or `command` or `sensor_id` has more than 16 bits.
     """
     if len(data) > MAX_DATA:
-        raise ValueError(f"{len(data)} bytes of data: an LP-BUS message holds {MAX_DATA}")
+        raise ValueError(f"{len(data)} bytes of data: an LP-BUS message holds at most {MAX_DATA}")
     try:
         head = _HEADER.pack(_START, sensor_id, command, len(data))
     except struct.error:

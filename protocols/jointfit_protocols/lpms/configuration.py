@@ -276,5 +276,5 @@ def identify_generation(data: bytes) -> Generation | None:
 
 
 def decode_text(data: bytes) -> str:
-    """Return an ASCII text without the spaces or zeros at its end."""
+    """Return an ASCII text without spaces, zeros and line ends before and after it."""
     return data.decode("ascii", "replace").strip(" \0\r\n")

@@ -53,7 +53,7 @@ def parse_description(data: bytes) -> StreamDescription | str:
     """Return the description in an XML document, or the reason why there is no valid one."""
     if len(data) > _LARGEST_XML:
         return "description too long"
-    if b"<!" in data:  # may define entities that expand to a text of any size
+    if b"<!" in data:  # a document type may define entities of any size
         return "description with a document type"
     try:
         root = ET.fromstring(data)  # noqa: S314 - without a document type there are no entities

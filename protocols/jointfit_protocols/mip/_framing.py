@@ -62,7 +62,7 @@ def encode(descriptor_set: int, fields: Iterable[MipField]) -> bytes:
         bytes((len(data) + _FIELD_HEAD, descriptor)) + data for descriptor, data in fields
     )
     if len(payload) > MAX_PAYLOAD:
-        raise ValueError(f"{len(payload)} bytes of fields: a MIP packet holds {MAX_PAYLOAD}")
+        raise ValueError(f"{len(payload)} bytes of fields: at most {MAX_PAYLOAD} fit a MIP packet")
     body = SYNC + bytes((descriptor_set, len(payload))) + payload
     return body + _checksum(body)
 

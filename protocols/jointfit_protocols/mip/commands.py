@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 Family = Literal["current", "legacy"]
 
 REPLY = 0xF1
-"""Descriptor of the field in every reply that contains command and code."""
+"""Descriptor of the field with command and code, which every reply contains."""
 REPLY_BYTES = 2
 """Size of the data of this field, bytes."""
 OK, UNKNOWN_COMMAND = 0, 1
@@ -240,7 +240,7 @@ def decode_descriptors(data: bytes) -> frozenset[int]:
 
 
 def encode_outputs(prefix: bytes, outputs: Iterable[tuple[int, int]]) -> bytes:
-    """Return the list of a message format, as in replies and (after the function) commands."""
+    """Return the list of a message format for a reply, or for a command after its function."""
     entries = [_OUTPUT.pack(*output) for output in outputs]
     return prefix + bytes((len(entries),)) + b"".join(entries)
 

@@ -12,7 +12,7 @@
 | 0x80, 0x06  | magnetic field, gauss                                                         |
 | 0x80, 0x0A  | quaternion w x y z of the complementary filter                                |
 | 0x80, 0x0C  | roll, pitch, yaw of the complementary filter, rad                             |
-| 0x80, 0x12  | GPS time of week s, week, flags; without a pulse per second plain device time |
+| 0x80, 0x12  | as any, 0xD3; without a pulse per second, the time of week is device time     |
 | 0x82, 0x03  | quaternion w x y z of the estimation filter, flags: 1 valid                   |
 | 0x82, 0x05  | roll, pitch, yaw of the estimation filter, rad, flags: 1 valid                |
 | 0x82, 0x10  | filter state, dynamics mode, flags                                            |
@@ -155,7 +155,7 @@ def field_bytes(descriptor_set: int, descriptor: int) -> int:
 
 
 def gps_ns(week: int, time_of_week_s: float) -> int | None:
-    """Return GPS time as a single number, ns; None if the time of week is not finite."""
+    """Return GPS time as a single number, ns; None if the time of week is implausible."""
     if not 0.0 <= time_of_week_s < _MOST_SECONDS:  # NaN compares false
         return None
     return week * WEEK_NS + round(time_of_week_s * 1e9)

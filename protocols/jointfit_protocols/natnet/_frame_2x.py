@@ -14,7 +14,7 @@ the origin without an orientation counts as not tracked.
 
 Source: NaturalPoint NatNet SDK 4.1, PythonClient.
 
-Invariant: `decode` inverts `encode`, except for the markers inside bodies, which are not returned.
+Invariant: `read_frame_2x` inverts `put_frame_2x`. The markers inside bodies are skipped.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ def encode_frame(frame: FrameOfData, version: Version) -> bytes:
         A value is out of the range of its field.
     """
     if not is_supported(version):
-        raise ValueError(f"bitstream {version[0]}.{version[1]} is not written")
+        raise ValueError(f"bitstream {version[0]}.{version[1]} cannot be encoded")
 
     if version < TICKED:
         return put_frame_2x(frame, version, _put_analog)

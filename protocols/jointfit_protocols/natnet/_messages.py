@@ -63,8 +63,8 @@ class ServerInfo(NamedTuple):
     application: str
     application_version: Version4
     natnet_version: Version4
-    """NatNet version of the server. Its first two numbers are the bitstream in use, unless it was
-    changed."""
+    """NatNet version of the server. Its first two numbers are the bitstream in use, unless the
+    bitstream was changed."""
     clock_hz: int | None
     """Number of ticks per second of the stamps in frames; None for a 2.x server."""
     data_port: int = 1511
@@ -151,7 +151,9 @@ def decode(datagram: bytes, version: Version) -> Message | CorruptBytes:
 
     number, size = HEADER.unpack_from(datagram)
     if size != len(datagram) - HEADER.size:
-        return CorruptBytes(len(datagram), "the length in the header is not the datagram's")
+        return CorruptBytes(
+            len(datagram), "the length in the header is not the length of the datagram"
+        )
 
     by_version = _VERSIONED.get(number)
     if by_version is not None:

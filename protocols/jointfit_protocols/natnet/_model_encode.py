@@ -36,7 +36,7 @@ def encode_model(model: ModelDefinition, version: Version) -> bytes:
         The bitstream is older than 2.5, or does not have one of the descriptions.
     """
     if not is_supported(version):
-        raise ValueError(f"bitstream {version[0]}.{version[1]} is not written")
+        raise ValueError(f"bitstream {version[0]}.{version[1]} cannot be encoded")
     parts = [I32.pack(len(model.descriptions))]
     for description in model.descriptions:
         kind, body = _put(description, version)

@@ -5,7 +5,7 @@ millimetres. Rotation matrices are in column-major order, from body to world. Fo
 that is not visible, all bits of its numbers are set, which is a NaN.
 
 Invariant: a count is compared with the size of its component before anything is read. A component
-of a known type is accepted only if its content has exactly its size.
+of a known type is accepted only if its content ends exactly at the end of the component.
 """
 
 from __future__ import annotations

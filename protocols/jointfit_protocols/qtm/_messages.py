@@ -1,7 +1,10 @@
-"""Packets of the QTM real-time protocol: ``u32 size, u32 type, data``, with the whole size.
+"""Packets of the QTM real-time protocol: ``u32 size, u32 type, data``.
 
-Invariant: `decode` never raises, and never reads more than the packet, whatever count or size it
-states. TCP and UDP use the same packets, but UDP only for data.
+The size includes the size and the type. TCP and UDP use the same packets, but UDP transports only
+frames and the discovery of servers.
+
+Invariant: `decode` never raises, and never reads more than the packet, whatever count or size the
+packet states.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Settings of a QTM server, parsed from the XML document that answers ``GetParameters``.
 
-The layout changed with version 1.21: `Body` has attributes of points instead of elements, and
-segments of skeletons are nested. Both layouts are supported. Only direct children are read, because
-meshes and points also have names. The root element is ``QTM_Parameters_Ver_x.y`` or
-``QTM_Settings``.
+From version 1.21 on, the points of a `Body` have attributes instead of elements, and the segments
+of a skeleton are nested. Both layouts are supported. The name of a body or marker is read only from
+a direct child, because meshes and points also have names. The root element is
+``QTM_Parameters_Ver_x.y`` or ``QTM_Settings``.
 
 Invariant: the size of the input is limited, entities are rejected, and no exception is raised. If
 the text is not such a document, the result is None.

@@ -2,11 +2,11 @@
 
 The frames of a sample arrive in a known order, usually the order of the identifiers. The last frame
 completes the sample. The next sample begins with a frame that repeats or precedes an earlier frame,
-or that arrives more than `longest_ns` after the first frame. Samples without all their measurements
-are incomplete, and are dropped. Time, counter and validity may be missing.
+or that arrives more than `longest_ns` after the first frame. A sample that lacks a measurement is
+incomplete, and is dropped. Time, counter and validity may be missing.
 
-Frames with the same identifier are multiplexed: some bits of the data, the multiplexer, say which
-frame it is. A frame with another multiplexer value is a frame of another device.
+Frames with the same identifier are multiplexed: some bits of the data, the multiplexer, identify
+the frame. A frame with another multiplexer value is a frame of another device.
 
 Invariant: the codec converts frames to samples. It uses no bus and no clock.
 """
@@ -43,7 +43,7 @@ class Multiplexer(NamedTuple):
         return (self.mask.bit_length() + 7) // 8
 
     def matches(self, data: bytes) -> bool:
-        """Return whether the data are those of the frame."""
+        """Return whether the data belong to the frame."""
         return len(data) >= self.size and int.from_bytes(data, "little") & self.mask in self.values
 
     def __and__(self, other: Multiplexer) -> Multiplexer:
@@ -120,7 +120,7 @@ class CanTableCodec:
         self.messages = 0
         """Number of well-formed frames of this device."""
         self.incomplete = 0
-        """Number of samples without all their measurements."""
+        """Number of samples that lack a measurement."""
         self.foreign = 0
         """Number of frames of other devices."""
         self.unmatched = 0

@@ -5,11 +5,11 @@
 | sum8       | (init + sum of all bytes) mod 256; sum16: mod 65536                         |
 | xor8       | init XOR all bytes                                                          |
 | fletcher16 | a = a + byte, b = b + a, both modulo `modulus`; first a, then b             |
-| crc8       | polynomial, init, reflected or not, as in the catalogue of parametrised CRC |
-| crc16      | algorithms; crc32 likewise                                                  |
+| crc8       | CRC with polynomial, init and reflection; the same for crc16 and crc32      |
 
-`xor_out` is combined with the result by XOR. A sum that, together with its checksum, is 0 modulo
-256 (two's complement) has init = xor_out = 0xFF.
+`xor_out` is combined with the result by XOR. The parameters of a CRC have the meanings of the
+catalogue of parametrised CRC algorithms. If the checksum is the two's complement of the sum, init
+and xor_out are 0xFF.
 
 Invariant: the checksums are pure functions of bytes. Parameters are compiled only once.
 """

@@ -99,7 +99,8 @@ def parse_type(text: str) -> tuple[Kind, int] | None:
         return None
     kind: Kind = "u" if match["kind"] == "u" else "i" if match["kind"] == "i" else "f"
     bits = int(match["bits"])
-    possible = bits in _FLOATS if kind == "f" else bits <= _MOST_BITS
+    least = 2 if kind == "i" else 1  # the sign and at least one digit
+    possible = bits in _FLOATS if kind == "f" else least <= bits <= _MOST_BITS
     return (kind, bits) if possible else None
 
 

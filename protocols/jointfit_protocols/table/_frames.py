@@ -119,7 +119,7 @@ class FrameCodec(ResynchronizingCodec[TableMessage]):
         return [item for item in found if not isinstance(item, TableMessage) or item.data]
 
     def flush(self) -> list[TableItem]:  # type: ignore[explicit-override]  # Python 3.12's
-        """End the input, or a silence; return frames that the pending bytes contain."""
+        """Discard an incomplete frame; return frames that the other pending bytes contain."""
         self._is_final = True
         found = self.feed(b"") + super().flush()
         self._is_final, self._in_step_at = False, -1

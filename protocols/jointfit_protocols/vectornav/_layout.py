@@ -119,7 +119,7 @@ class BinaryLayout:
 
         self.struct = struct.Struct(written)
         self.header = header_of(masks)
-        """Number of bytes from ``groups`` to the start of the payload."""
+        """Bytes from ``groups`` to the start of the payload."""
 
 
 def header_of(masks: Mapping[int, int]) -> bytes:

@@ -90,7 +90,7 @@ def decode_output(values: Sequence[str]) -> BinaryOutput | None:
 
 
 def _group_bytes(header: Sequence[int]) -> int:
-    """Return the number of bytes of groups; bit 7 of the first one announces another."""
+    """Return the number of group bytes; bit 7 of the first byte announces a second byte."""
     return 1 + (header[0] >> 7 & 1)
 
 

@@ -86,7 +86,7 @@ class WitMotionCodec(ResynchronizingCodec[WitMotionFrame]):
 
     def __init__(self) -> None:
         super().__init__(self._read_frame, _AT_START, _RUN, _NO_START.reason, FRAME_BYTES)
-        self._other_at = -1
+        self._other_at = -1 - max(_OTHER_SIZES)  # too far from the first frame to be counted
         self.other_frames = 0
         """Number of frames of the variant 55 61 so far. The variant is not decoded."""
 

@@ -110,7 +110,7 @@ def encode(mid: int, data: bytes = b"", bid: int = MASTER) -> bytes:
         `data` has more than 2048 bytes.
     """
     if len(data) > MAX_DATA:
-        raise ValueError(f"{len(data)} bytes of data: an Xbus message holds {MAX_DATA}")
+        raise ValueError(f"{len(data)} bytes of data: an Xbus message holds at most {MAX_DATA}")
     if len(data) < _EXTENDED:
         body = bytes((bid, mid, len(data))) + data
     else:

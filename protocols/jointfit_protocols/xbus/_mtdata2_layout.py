@@ -67,7 +67,10 @@ class MTData2Layout:
 
     @staticmethod
     def of(items: Sequence[tuple[int, bytes]], wanted: Container[int]) -> MTData2Layout | None:
-        """Return the layout of the items; None if there are none, or if one has no struct code."""
+        """Return the layout of the items; None if a wanted item has no struct code.
+
+        The result is also None if there are no items.
+        """
         plain = all(
             data_id & 0xFFF0 not in wanted or _form(data_id, raw)[0] for data_id, raw in items
         )
@@ -89,7 +92,7 @@ class MTData2Layout:
 
 
 def _form(data_id: int, raw: bytes) -> tuple[int, str]:
-    """Return an item's number of values and their struct code; 0 if the item has none."""
+    """Return an item's number of values and their struct code; 0 values without a struct code."""
     if data_id in COUNT_BYTES:
         return 1, _COUNT_CODES[len(raw)]
     count = reals_in(data_id)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 MAX_RATE = 0xFFFF
-"""Value that requests the highest possible rate. Time and status items always report it."""
+"""Value that requests the highest possible rate. Time and status items always report this value."""
 TICK_NS = 100_000
 """Duration of one tick of SampleTimeFine, ns."""
 WRAP_32_BIT = 1 << 32
@@ -66,9 +66,9 @@ class SyncSetting(NamedTuple):
     skip_first: int = 0
     skip_factor: int = 0
     pulse_width: int = 0
-    """Width of the pulses on an output, 100 us."""
+    """Width of the pulses on an output, in units of 100 us."""
     delay: int = 0
-    """Delay, 100 us. For clock bias estimation, it is the reference period, ms."""
+    """Delay, in units of 100 us. For clock bias estimation, it is the reference period, ms."""
 
 
 class Firmware(NamedTuple):

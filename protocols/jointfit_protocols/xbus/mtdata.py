@@ -66,8 +66,8 @@ FORMAT_SHIFT = 8
 NO_INPUT_1, NO_INPUT_2 = 0x400, 0x800
 NED = 0x8000_0000
 _CONFIGURATION = struct.Struct(">96xH6xHI8x")
-"""Layout of a Configuration message: number of devices, and output mode and settings of the
-first."""
+"""Layout of a Configuration message: number of devices, and output mode and output settings of the
+first device."""
 _ORIENTATION_MASK, _FORMAT_MASK = 0xC, 0x3
 _KNOWN_MODES = sum(OutputMode)
 _RAW_BYTES, _GNSS_BYTES, _UTC_BYTES, _INPUT_BYTES = 20, 44, 12, 2

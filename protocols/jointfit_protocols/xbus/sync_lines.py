@@ -1,4 +1,4 @@
-"""Names of the functions that the sync lines of an Xbus device can have.
+"""Numbers and names in the sync settings of an Xbus device: functions, lines, polarities.
 
 An entry of the synchronisation settings (`configuration.SyncSetting`) assigns a function to a line.
 An edge on an input with the function ``trigger_indication`` is reported in the next MTData2
@@ -6,10 +6,11 @@ message. The output configuration must contain the item TriggerIn1 or TriggerIn2
 
     | line U1 | polarity U1 | time U4, ticks of SampleTimeFine | frame U2 |
 
-The number of the output line depends on the series. The number is 4; from the MTi-600 on, it is 7.
+The number of the output line is 7 for the MTi-600 series, and 4 for all other series.
 
 Source: MT0101P rev. 2020.A. The layout of the item is from the vendor's public headers. These
-sources do not document the unit of the item's time.
+sources do not document the unit of the item's time, which is assumed to be the unit of
+SampleTimeFine.
 """
 
 from __future__ import annotations

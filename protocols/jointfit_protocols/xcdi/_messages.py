@@ -33,7 +33,7 @@ COUNTER_MODULUS = 2**16
 QUATERNION_SCALE = 1 / 32767
 """Value of one count. The count 0x8000 is -1.00003, which must be normalised and not rejected."""
 OVERFLOW = 1
-"""Error code that the output buffer overflowed, so that at least one frame is lost."""
+"""Error code for an overflow of the output buffer, in which at least one frame is lost."""
 
 
 class DataId(IntEnum):
@@ -178,8 +178,8 @@ class XcdiCodec:
     """Codec that converts one sensor's frames to groups; it never raises.
 
     SampleTime opens a group, and Quaternion completes it. A second SampleTime or counter before the
-    Quaternion counts as one incomplete group. A Quaternion without an open group has a counter but
-    no device time. Frames with other identifiers are counted and ignored.
+    Quaternion counts as one incomplete group. A Quaternion without an open group has no device
+    time, but it may have a counter. Frames with other identifiers are counted and ignored.
 
     Parameters
     ----------

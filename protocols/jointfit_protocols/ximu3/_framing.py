@@ -36,7 +36,7 @@ _NEVER = 1 << 62
 _QUATERNION = (0xD1, 26)
 """First byte and size of a binary message with a quaternion."""
 _SHORTEST_RUN = 4
-"""Number of consecutive messages of one kind from which they are decoded together."""
+"""Smallest number of consecutive messages of one kind that are decoded together."""
 _LONGEST_RUN = 64
 """Largest number of messages decoded together. It limits the number of bytes that a failed attempt
 reads."""
@@ -137,7 +137,7 @@ class XImu3Codec:
         return found
 
     def flush(self) -> list[Found]:
-        """End the input, or a silence; return the pending bytes as corrupt."""
+        """Discard an incomplete message; return the pending bytes as corrupt."""
         found: list[Found] = []
         self._discard(len(self._pending), _TOO_LONG if self._too_long else _CUT_OFF, found)
         self._pending, self._too_long = b"", False

@@ -146,7 +146,7 @@ UNKNOWN = MessageFault("no known message")
 UNKNOWN_KIND = "message of unknown kind "
 """Beginning of the reason for a line that has the form of a data message but unknown content."""
 _JSON = MessageFault("JSON with other than one key, or malformed")
-_STUFFING = MessageFault("escape byte before neither DC nor DD")
+_STUFFING = MessageFault("escape byte without DC or DD after it")
 _LENGTH = MessageFault("binary message of another length")
 _ASCII = MessageFault("malformed ASCII message")
 _CHANNELS = MessageFault("message of a multiplexer malformed")
@@ -182,7 +182,7 @@ def parse_rest(rest: bytes, end: int) -> XImu3Data | XImu3Reply | None:
 
     The rules are stricter than those of `parse_line`, in order to prevent accidental matches. Text
     and multiplexers are rejected, and the time must be plausible. An object must have no blank
-    before its key. Otherwise the search of a line of braces would also be slow.
+    before its key, which also limits the time to search a line of many braces.
     """
     if rest[0] == OBJECT:
         if not rest.startswith(b'{"'):

@@ -116,7 +116,7 @@ def test_a_silence_with_running_clock_is_a_gap() -> None:
 def test_invalid_samples_and_wrong_norms_are_refused() -> None:
     samples = RecordSamples(FORM._replace(mask=0x06, equals=0x02))
     items = samples.take(record(0, valid=0x04)) + samples.take(record(1, valid=0x0A))
-    assert summary(items) == ["the device reports it as invalid", 10_000]
+    assert summary(items) == ["the device marks the sample as invalid", 10_000]
     zero = record(2)._replace(values=(0.0, 0.0, 0.0, 0.0, 20_000, 2, 0x02))
     assert summary(samples.take(zero)) == ["quaternion norm is not 1"]
     assert (samples.refused, samples.refused_bytes) == (2, 40)

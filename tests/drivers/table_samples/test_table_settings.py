@@ -84,7 +84,8 @@ Q = {"offset": 2, "type": "i16", "divisor": 32767}
             "fields.counter: shares byte 9 with fields.quaternion: correct offset or type",
         ),
         (serial({"quaternion": Q | {"type": "int16"}}), "'int16' is no type: expected u1 to u64"),
-        (serial({"quaternion": Q | {"order": "wxy"}}), "component z has no place"),
+        (serial({"quaternion": Q | {"type": "i1"}}), "'i1' is no type: expected u1 to u64, i2 to"),
+        (serial({"quaternion": Q | {"order": "wxy"}}), "component z is missing"),
         (serial({"quaternion": Q | {"order": "abcd"}}), "expected letters of 'wxyz'"),
         (serial({"quaternion": Q | {"scale": 2.0}}), "expected either `scale` or `divisor`"),
         (serial({"quaternion": Q | {"column": 3}}), "is for text lines: give `offset`"),
@@ -130,7 +131,7 @@ Q = {"offset": 2, "type": "i16", "divisor": 32767}
         ),
         (
             on_can({"quaternion": Q | {"offset": 0}}, ids={"a": 0x200, "b": 0x200}),
-            "ids.b: 0x200 is that of a already",
+            "ids.b: 0x200 is also the identifier of a",
         ),
         (
             on_can({"quaternion": Q | {"offset": 0}}, ids={"quaternion": 0x181}),
@@ -142,7 +143,7 @@ Q = {"offset": 2, "type": "i16", "divisor": 32767}
                 ids={"a": 0x200, "b": 0x200},
                 starts_with={"a": "01", "b": "01 02"},
             ),
-            "ids.b: 0x200 is that of a already: give each its own, or the data bytes with which",
+            "ids.b: 0x200 is also the identifier of a: correct one of them, or set `starts_with`",
         ),
         (
             on_can(

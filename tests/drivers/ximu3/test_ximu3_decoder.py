@@ -277,7 +277,7 @@ def test_edges_are_pulses_of_the_configured_wire() -> None:
     pulses = [event for event in rising if isinstance(event, SyncPulse)]
     assert [(pulse.ticks, pulse.line) for pulse in pulses] == [(1_091_000, 2), (1_093_000, 2)]
     assert [event for event in rising if isinstance(event, Corrupt)] == [
-        Corrupt(14, "time of an edge far from that of the measurements", rejected=1)
+        Corrupt(14, "time of an edge is far from the time of the measurements", rejected=1)
     ]
     falling = fed(decoder(sync_wire=2, sync_edge="falling"), *wires[:-1])
     assert [e.ticks for e in falling if isinstance(e, SyncPulse)] == [1_090_000, 1_092_000]

@@ -213,6 +213,25 @@ async def test_a_passive_driver_sends_nothing_and_names_other_outputs(
 
 
 @pytest.mark.usefixtures("short_listening")
+async def test_a_passive_driver_names_the_settings_that_send_the_expected_messages(
+    tmp_path: Path,
+) -> None:
+    pytest.importorskip("vqf")
+    gateway = {"passive": True, "orientation": "gateway", "settle_s": 0}
+    inertial = "inertial_message_rate_divisor to 400 divided by rate_hz"
+    stored: dict[str, object] = {"inertial_message_rate_divisor": 0}
+    async with serving(device(tmp_path, stored), feeding=True):
+        text = await refusal(make(tmp_path, **gateway))
+    assert f'I (inertial): set orientation = "device", or in the device {inertial}' in text
+
+    async with serving(device(tmp_path, stored | {"ahrs_message_type": 3}), feeding=True):
+        text = await refusal(make(tmp_path, **gateway))
+        assert f"expected I (inertial): set in the device {inertial}" in text
+        text = await refusal(make(tmp_path, passive=True))
+        assert "set in the device ahrs_message_type to 0 and ahrs_message_rate_divisor to" in text
+
+
+@pytest.mark.usefixtures("short_listening")
 async def test_a_passive_driver_names_a_wrong_speed_and_silence(tmp_path: Path) -> None:
     async with serving(device(tmp_path, baud=460_800), feeding=True):
         text = await refusal(make(tmp_path, passive=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -92,6 +93,81 @@ def test_bus_off_is_serious_and_a_restart_is_not() -> None:
     passive = describe_error(CanFrame(0, 0x04, b"\0\x10\0\0\0\0\0\0", error=True))
     assert passive.serious
     assert "passive" in passive.text
+
+
+@pytest.mark.parametrize(
+    ("can_id", "text", "serious"),
+    [
+        (0x001, "transmit timeout", False),
+        (0x002, "arbitration lost", False),
+        (0x008, "protocol violation", False),
+        (0x010, "transceiver fault", True),
+        (0x020, "no acknowledgment", True),
+        (0x040, "bus off", True),
+        (0x080, "bus error", False),
+        (0x100, "controller restarted", False),
+        (0x200, "CAN error class 0x200", False),
+    ],
+)
+def test_error_classes_are_those_of_linux(can_id: int, text: str, serious: bool) -> None:
+    found = describe_error(CanFrame(0, can_id, bytes(8), error=True))
+    assert found.text.startswith(text)
+    assert found.serious is serious
+
+
+@pytest.mark.parametrize(
+    ("state", "text", "serious"),
+    [
+        (0x01, "receive overflow", True),
+        (0x02, "transmit overflow", False),
+        (0x04, "error warning level", False),
+        (0x08, "error warning level", False),
+        (0x10, "error passive", True),
+        (0x20, "error passive", True),
+        (0x40, "error active again", False),
+        (0x00, "CAN error class 0x4", False),
+    ],
+)
+def test_controller_states_are_those_of_linux(state: int, text: str, serious: bool) -> None:
+    found = describe_error(CanFrame(0, 0x004, bytes([0xFF, state, 0xFF]), error=True))
+    assert found.text.startswith(text)
+    assert found.serious is serious
+
+
+def test_an_error_frame_without_the_state_of_the_controller_has_a_description() -> None:
+    short = CanFrame(0, 0x004, b"\xff", error=True)
+    assert describe_error(short) == ("CAN error class 0x4", False)
+    two = describe_error(CanFrame(0, 0x004, b"\0\x03", error=True))
+    assert two.text == "receive overflow: the controller lost frames; transmit overflow"
+
+
+def test_a_record_holds_eight_bytes_and_no_more() -> None:
+    (found,) = unpack_frames(pack_frames([CanFrame(-1, 0x7FF, bytes(range(8)))]))
+    assert found == CanFrame(-1, 0x7FF, bytes(range(8)))
+    with pytest.raises(ValueError, match="at most 8 bytes, not 9"):
+        pack_frames([CanFrame(0, 1, bytes(9))])
+
+
+def test_a_record_has_the_documented_layout() -> None:
+    frames = [CanFrame(1, 2, b"ab"), CanFrame(3, 0x7FF, b"", remote=True)]
+    assert pack_frames(frames).hex() == (
+        "0100000000000000" "02000000" "00" "02" "0000" "6162000000000000"
+        "0300000000000000" "ff070000" "02" "00" "0000" "0000000000000000"
+    )  # fmt: skip
+    notes = [host_dropped(0, 258), host_corrupt(0, 1)]
+    assert [(note.can_id, note.data.hex()) for note in notes] == [
+        (0x1000_0000, "0201000000000000"), (0x0800_0000, "0100000000000000"),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("flags", "largest"), [(0, 0x7FF), (1, 0x1FFF_FFFF), (2, 0x7FF), (4, 0x1FFF_FFFF)]
+)
+def test_the_largest_identifier_depends_on_the_flags(flags: int, largest: int) -> None:
+    for can_id in (largest, largest + 1):
+        record = (1).to_bytes(8, "little") + can_id.to_bytes(4, "little")
+        (found,) = unpack_frames(record + bytes([flags]) + bytes(11))
+        assert isinstance(found, CanFrame) == (can_id == largest)
 
 
 def candump_line(frame: CanFrame) -> str:

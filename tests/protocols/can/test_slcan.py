@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -128,6 +129,84 @@ def test_a_line_that_came_whole_is_not_stamped_before_the_previous_read() -> Non
     assert frame.t_ns == 1_000_000_000
 
 
-def test_the_nine_bit_rates() -> None:
-    assert BITRATES.index(1_000_000) == 8
-    assert len(BITRATES) == len(set(BITRATES)) == 9
+def test_the_nine_bit_rates_are_those_of_the_manual() -> None:
+    assert tuple(rate / 1000 for rate in BITRATES) == (10, 20, 50, 100, 125, 250, 500, 800, 1000)
+
+
+@pytest.mark.parametrize(
+    ("frame", "time_ms", "line"),
+    [
+        (CanFrame(0, 0x21, b"\xab\xcd"), None, b"t0212ABCD\r"),
+        (CanFrame(0, 0x21, b"\xab\xcd"), 59_999, b"t0212ABCDEA5F\r"),
+        (CanFrame(0, 0x21, b"\xab\xcd"), 60_001, b"t0212ABCD0001\r"),
+        (CanFrame(0, 0x21, b"", extended=True), None, b"T000000210\r"),
+        (CanFrame(0, 0x7FF, b"", remote=True), None, b"r7FF0\r"),
+        (CanFrame(0, 0x1FFF_FFFF, b"", extended=True, remote=True), None, b"R1FFFFFFF0\r"),
+    ],
+)
+def test_lines_have_the_form_of_the_manual(
+    frame: CanFrame, time_ms: int | None, line: bytes
+) -> None:
+    assert encode_frame(frame, time_ms) == line
+    assert decoded([line]) == ([frame], 0)
+
+
+@pytest.mark.parametrize(
+    ("role", "letters", "least", "most"),
+    [
+        ("host", "VvN", 1, 40),
+        ("host", "F", 2, 2),
+        ("host", "zZ", 0, 0),
+        ("adapter", "OlLCVvNFAPX", 0, 1),
+        ("adapter", "SZUQW", 1, 2),
+        ("adapter", "s", 4, 6),
+        ("adapter", "mM", 8, 8),
+    ],
+)
+def test_arguments_have_the_lengths_of_the_manual(
+    role: Role, letters: str, least: int, most: int
+) -> None:
+    for letter in letters:
+        for count in range(max(least - 1, 0), most + 2):
+            line, argument = f"{letter}{'1' * count}\r".encode(), "1" * count
+            accepted = [SlcanLine(letter, argument)] if least <= count <= most else []
+            assert decoded([line], role) == (accepted, 0 if accepted else len(line))
+
+
+def test_frames_of_one_read_over_usb_are_stamped_by_their_duration_on_the_bus() -> None:
+    decoder = SlcanCodec(None, bitrate=500_000)  # a bit in 2 us
+    frames = [
+        CanFrame(0, 0x21, bytes(8)),  # 111 bits
+        CanFrame(0, 0x21, bytes(8), extended=True),  # 131 bits
+        CanFrame(0, 0x21, b"", remote=True),  # 47 bits
+    ]
+    found = decoder.feed(b"z\r" + b"".join(map(encode_frame, frames)) + b"\r", 1_000_000_000)
+    assert [item.t_ns for item in found if isinstance(item, CanFrame)] == [
+        1_000_000_000 - 289 * 2000, 1_000_000_000 - 178 * 2000, 1_000_000_000 - 47 * 2000,
+    ]  # fmt: skip
+    (late,) = decoder.feed(encode_frame(frames[0]), 1_000_000_001)
+    assert isinstance(late, CanFrame)
+    assert late.t_ns == 1_000_000_000  # not before the previous read
+
+
+def test_a_frame_behind_noise_is_stamped_at_its_own_start() -> None:
+    decoder = SlcanCodec(100_000)  # a character in 100 us
+    line = encode_frame(CanFrame(0, 0x21, b"ab"))  # 10 characters
+    noise, frame = decoder.feed(b"xyz" + line, 1_000_000_000)
+    assert noise == (3, "no SLCAN line")
+    assert isinstance(frame, CanFrame)
+    assert frame.t_ns == 1_000_000_000 - 10 * 100_000
+
+
+def test_a_line_without_end_loses_all_but_its_last_32_characters() -> None:
+    decoder = SlcanCodec(None)
+    assert decoder.feed(b"x" * 64, 0) == []
+    assert decoder.feed(b"x", 0) == [(33, "line without end")]
+    assert decoder.flush() == [(32, "unfinished line")]
+    assert decoder.discarded_bytes == 65
+
+
+def test_the_bus_runs_at_one_megabit_by_default() -> None:
+    (frame,) = SlcanCodec(None).feed(encode_frame(CanFrame(0, 1, bytes(8))), 0)
+    assert isinstance(frame, CanFrame)
+    assert frame.t_ns == -111_000

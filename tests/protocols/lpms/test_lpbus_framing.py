@@ -161,3 +161,22 @@ def test_time_is_linear_in_bytes() -> None:
 def test_a_message_that_cannot_be_sent_is_refused(arguments: tuple[Any, ...], text: str) -> None:
     with pytest.raises(ValueError, match=text):
         encode(*arguments)
+
+
+def test_a_message_holds_at_most_1024_bytes() -> None:
+    longest = encode(9, bytes(1024))
+    assert len(longest) == MAX_MESSAGE == 1035
+    (message,) = LpBusCodec().feed(longest)
+    assert message == LpBusMessage(1, 9, bytes(1024), 1035)
+    assert isinstance(message, LpBusMessage)
+    assert message.size == 1035
+    with pytest.raises(ValueError, match="1025 bytes of data"):
+        encode(9, bytes(1025))
+
+
+def test_numbers_have_16_bits() -> None:
+    (message,) = LpBusCodec().feed(encode(65_535, b"", 65_535))
+    assert message == LpBusMessage(65_535, 65_535, b"", 11)
+    for command, sensor_id in ((65_536, 1), (1, 65_536), (-1, 1)):
+        with pytest.raises(ValueError, match="expected 0 to 65535 each"):
+            encode(command, b"", sensor_id)

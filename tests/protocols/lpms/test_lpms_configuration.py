@@ -130,6 +130,74 @@ def test_settings_read_as_they_were_sent(table: CommandTable, data: st.DataObjec
     assert made == sent
 
 
+def test_outputs_have_the_order_and_bits_of_the_register_headers() -> None:
+    first, third = (
+        [(output.name, output.bit, output.values) for output in table.outputs]
+        for table in (GENERATION_1, GENERATION_3)
+    )
+    assert first == [
+        ("gyro_raw", 12, 3), ("accelerometer_raw", 11, 3), ("magnetometer_raw", 10, 3),
+        ("angular_velocity", 16, 3), ("quaternion", 18, 4), ("euler", 17, 3),
+        ("linear_acceleration", 21, 3), ("pressure", 9, 1), ("altitude", 19, 1),
+        ("temperature", 13, 1), ("heave", 14, 1),
+    ]  # fmt: skip
+    assert third == [
+        ("accelerometer_raw", 0, 3), ("accelerometer", 1, 3), ("gyro0_raw", 2, 3),
+        ("gyro1_raw", 3, 3), ("gyro0_bias_calibrated", 4, 3), ("gyro1_bias_calibrated", 5, 3),
+        ("gyro0", 6, 3), ("gyro1", 7, 3), ("magnetometer_raw", 8, 3), ("magnetometer", 9, 3),
+        ("angular_velocity", 10, 3), ("quaternion", 11, 4), ("euler", 12, 3),
+        ("linear_acceleration", 13, 3), ("pressure", 14, 1), ("altitude", 15, 1),
+        ("temperature", 16, 1),
+    ]  # fmt: skip
+    mask = GENERATION_3.mask("gyro0", "temperature")
+    assert (mask, GENERATION_3.names(mask)) == (0x1_0040, ["gyro0", "temperature"])
+
+
+def test_commands_and_rates_are_those_of_the_register_headers() -> None:
+    first, third = (
+        (
+            table.set_outputs, table.set_rate, table.set_precision, table.store,
+            table.factory_reset, table.read_firmware, table.reads, table.tick_hz,
+        )
+        for table in (GENERATION_1, GENERATION_3)
+    )  # fmt: skip
+    assert first == (0x0A, 0x0B, 0x4B, 0x0F, 0x10, 0x2F, (0x04,), 400)
+    assert third == (0x1E, 0x22, 0x88, 0x04, 0x05, 0x15, (0x1F, 0x23, 0x89), 500)
+    assert GENERATION_1.rates_hz == (5, 10, 25, 50, 100, 200, 400)
+    assert GENERATION_3.rates_hz == (5, 10, 50, 100, 250, 500, 1000)
+    assert [command.value for command in LpmsCommand] == [0, 1, 6, 7, 9, 0x5B]
+
+
+def test_the_configuration_word_of_generation_1_has_outputs_rate_and_precision() -> None:
+    (read,) = GENERATION_1.reads
+    word = (0x0044_0006).to_bytes(4, "little")  # quaternion, int16, the last code of a rate
+    found = LpmsConfiguration(0x0004_0000, 400, floats=False)
+    assert decode_configuration(GENERATION_1, read, word) == found
+    assert encode_configuration(GENERATION_1, read, found) == word
+    no_rate = decode_configuration(GENERATION_1, read, (0x7).to_bytes(4, "little"))
+    assert no_rate == LpmsConfiguration(0, None, floats=True)
+    assert decode_configuration(GENERATION_1, read, word[:-1]) is None
+    assert decode_configuration(GENERATION_1, read + 1, word) is None
+
+
+def test_a_reply_of_generation_3_has_one_setting() -> None:
+    replies = [
+        decode_configuration(GENERATION_3, command, b"\1\0\0\0") for command in GENERATION_3.reads
+    ]
+    assert replies == [
+        LpmsConfiguration(outputs=1), LpmsConfiguration(rate_hz=1), LpmsConfiguration(floats=True),
+    ]  # fmt: skip
+    with pytest.raises(ValueError, match="every setting must be known"):
+        encode_configuration(GENERATION_3, 0x1F, LpmsConfiguration(outputs=1, rate_hz=5))
+
+
+@GENERATIONS
+def test_other_commands_set_no_setting(table: CommandTable) -> None:
+    assert set_command(table, LpmsConfiguration()) == []
+    assert decode_set(table, table.store, bytes(4)) is None
+    assert decode_set(table, table.set_rate, bytes(3)) is None
+
+
 def test_the_two_generations_count_precision_in_opposite_senses() -> None:
     sixteen = LpmsConfiguration(floats=False)
     assert set_command(GENERATION_1, sixteen) == [(0x4B, b"\1\0\0\0")]
@@ -173,6 +241,11 @@ def test_a_quaternion_alone_has_the_same_packet_in_both_generations() -> None:
         (b"B2\0\0", 1),
         (b"\x02\0\0\0", 3),
         (b"\0\0\0\0", 3),
+        (b"\x02\0\0\1", None),
+        (b" ~", 1),
+        (b"\x1f", None),
+        (b"\x7f", None),
+        (bytes(5), None),
         (b"", None),
         (b"\xff\xfe\xfd", None),
     ],

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.lsl import (
     FORMATS,
+    MOST_CHANNELS,
     Channel,
     LslCodec,
     RoundTrip,
@@ -140,5 +141,117 @@ def test_samples_before_the_description_are_counted() -> None:
     assert codec.undescribed == 1
 
 
+def test_chunks_have_the_bytes_of_the_specification() -> None:
+    assert encode_samples("int16", [1.0], [[5, -1]]).hex() == (
+        "01" "15" "0300" "01000000" "01" "01" "08" "000000000000f03f" "0500" "ffff"
+    )  # fmt: skip
+    assert encode_round_trip(RoundTrip(1, 2, 1.0)).hex() == (
+        "01" "1e" "464a" "01000000" "0100000000000000" "0200000000000000" "000000000000f03f"
+    )  # fmt: skip
+    assert encode_description("é").hex() == "0108020001000000c3a9"
+
+
+@pytest.mark.parametrize(("samples", "head"), [(1, "01 01"), (255, "01 ff"), (256, "04 00010000")])
+def test_a_length_has_the_fewest_bytes(samples: int, head: str) -> None:
+    wire = encode_samples("int8", [0.0] * samples, [[1]] * samples)
+    chunk_head = 1 + wire[0]
+    assert wire[chunk_head + 6 :].startswith(bytes.fromhex(head))
+    content = len(wire) - chunk_head
+    assert int.from_bytes(wire[1:chunk_head], "little") == content
+    assert wire[0] == (1 if content < 256 else 4)
+    codec = described(1, "int8")
+    (found,) = codec.feed(wire)
+    assert isinstance(found, Samples)
+    assert len(found.values) == samples
+    assert codec.messages == samples + 1
+
+
+def test_a_length_of_eight_bytes_is_read() -> None:
+    content = (
+        struct.pack("<HI", 3, 1) + b"\x08" + struct.pack("<Q", 1) + struct.pack("<Bdb", 8, 2, 3)
+    )
+    (found,) = described(1, "int8").feed(b"\x08" + struct.pack("<Q", len(content)) + content)
+    assert found == Samples((2.0,), ((3,),))
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+def test_samples_without_a_time_stamp_are_corrupt(samples: int) -> None:
+    wire = bytearray(encode_samples("int8", [0.0] * samples, [[1]] * samples))
+    wire[-10] = 0  # the number of bytes of the last stamp
+    (found,) = described(1, "int8").feed(bytes(wire))
+    assert found == CorruptBytes(len(wire), "sample without a time stamp")
+
+
+def test_messages_before_a_corrupt_chunk_remain_and_the_rest_is_discarded() -> None:
+    codec = described(1, "int8")
+    trip = RoundTrip(1, 2, 3.0)
+    assert codec.feed(encode_round_trip(trip) + b"\x02abcdef") == [
+        trip, CorruptBytes(7, "no XDF chunk"),
+    ]  # fmt: skip
+    assert (codec.messages, codec.discarded) == (2, 7)
+
+
+def test_chunks_of_other_kinds_are_counted_and_skipped() -> None:
+    codec = described(1, "int8")
+    assert codec.feed(b"\x01\x06\x04\x00\x01\x00\x00\x00") == []
+    assert (codec.messages, codec.discarded) == (2, 0)
+    short = b"\x01\x07\x46\x4a\x01\x00\x00\x00\x00"
+    assert codec.feed(short) == [CorruptBytes(9, "round trip of 1 bytes")]
+
+
+@pytest.mark.parametrize(
+    ("count", "reason"),
+    [
+        ("0", "0 channels, expected 1 to 20000"),
+        (str(MOST_CHANNELS + 1), "20001 channels, expected 1 to 20000"),
+        ("12345678", "description without a number of channels"),
+        ("-1", "description without a number of channels"),
+        ("", "description without a number of channels"),
+    ],
+)
+def test_a_number_of_channels_out_of_range_is_rejected(count: str, reason: str) -> None:
+    wire = encode_description(f"<info><channel_count>{count}</channel_count></info>")
+    assert LslCodec().feed(wire) == [CorruptBytes(len(wire), reason)]
+
+
+def test_the_largest_number_of_channels_is_accepted() -> None:
+    wire = encode_description(f"<info><channel_count>{MOST_CHANNELS}</channel_count></info>")
+    (found,) = LslCodec().feed(wire)
+    assert isinstance(found, StreamDescription)
+    assert found.channel_count == 20_000
+    assert (found.rate_hz, found.compensated_lag_s, found.channels) == (0.0, 0.0, ())
+
+
+@pytest.mark.parametrize(
+    ("rate", "lag", "expected"),
+    [
+        ("1e6", "10", (1e6, 10.0)),
+        ("1000001", "10.1", (0.0, 0.0)),
+        ("-1", "-1", (0.0, 0.0)),
+        ("fast", "nan", (0.0, 0.0)),
+    ],
+)
+def test_numbers_out_of_range_are_unknown(
+    rate: str, lag: str, expected: tuple[float, float]
+) -> None:
+    wire = encode_description(
+        f"<info><channel_count>1</channel_count><nominal_srate>{rate}</nominal_srate><desc>"
+        f"<acquisition><compensated_lag>{lag}</compensated_lag></acquisition></desc></info>"
+    )
+    (found,) = LslCodec().feed(wire)
+    assert isinstance(found, StreamDescription)
+    assert (found.rate_hz, found.compensated_lag_s) == expected
+
+
+def test_an_overlong_description_is_rejected() -> None:
+    head = b"<info><channel_count>1</channel_count></info>"
+    longest = head + b" " * ((8 << 20) - len(head))
+    for xml_text, accepted in ((longest, True), (longest + b" ", False)):
+        (found,) = LslCodec().feed(encode_description(xml_text.decode()))
+        assert isinstance(found, StreamDescription) is accepted
+
+
 def test_every_format_of_numbers_has_a_size() -> None:
-    assert {struct.calcsize(f"<{code}") for code in FORMATS.values()} == {1, 2, 4, 8}
+    assert {name: struct.calcsize(f"<{code}") for name, code in FORMATS.items()} == {
+        "float32": 4, "double64": 8, "int8": 1, "int16": 2, "int32": 4, "int64": 8,
+    }  # fmt: skip

@@ -61,13 +61,31 @@ def test_a_frame_is_decoded_as_it_was_encoded(version: tuple[int, int]) -> None:
     assert decode(encode(frame, version), version) == frame
 
 
-@pytest.mark.parametrize(("version", "end"), [((2, 5), 4), ((2, 6), 10), ((2, 7), 14)])
-def test_the_end_of_a_frame_has_the_documented_fields(version: tuple[int, int], end: int) -> None:
+@pytest.mark.parametrize(
+    ("version", "layout", "end"),
+    [((2, 5), "<i", (0,)), ((2, 6), "<fhi", (2.0, 0, 0)), ((2, 7), "<dhi", (2.0, 0, 0))],
+)
+def test_the_end_of_a_frame_has_the_documented_fields(
+    version: tuple[int, int], layout: str, end: tuple[float, ...]
+) -> None:
     wire = encode(FrameOfData(9, 2.0, 0, 0, 0), version)
     # number, five empty sections, time stamp in place of the latency, timecode, sub-frame
     head = struct.pack("<i5ifII", 9, 0, 0, 0, 0, 0, 2.0, 0, 0)
-    assert wire[4 : 4 + len(head)] == head
-    assert len(wire) == 4 + len(head) + end
+    assert wire[4:] == head + struct.pack(layout, *end)
+
+
+@pytest.mark.parametrize(
+    ("version", "sections"), [((2, 8), 5), ((2, 9), 6), ((2, 10), 6), ((2, 11), 7)]
+)
+def test_force_plates_begin_with_2_9_and_devices_with_2_11(
+    version: tuple[int, int], sections: int
+) -> None:
+    payload = struct.pack("<i", 9) + bytes(4 * sections)
+    payload += struct.pack("<fIIdhi", 2.0, 0, 0, 2.0, 0, 0)
+    wire = struct.pack("<HH", 7, len(payload)) + payload
+    frame = FrameOfData(9, 2.0, 0, 0, 0)
+    assert decode(wire, version) == frame
+    assert encode(frame, version) == wire
 
 
 def test_markers_inside_a_body_are_skipped() -> None:

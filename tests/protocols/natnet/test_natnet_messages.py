@@ -34,7 +34,7 @@ from jointfit_protocols.natnet import (
     encode,
 )
 from jointfit_protocols.natnet._cursor import Cursor, MalformedError
-from jointfit_protocols.natnet._frame import Analog, Asset, Skeleton
+from jointfit_protocols.natnet._frame import Analog, Asset, Skeleton, read_analogs
 from jointfit_protocols.natnet._messages import MessageString
 from jointfit_protocols.natnet._model import (
     AssetMarkerDescription,
@@ -218,6 +218,24 @@ def test_a_hostile_count_is_corrupt(place: int, count: int) -> None:
 def test_count_beyond_the_remaining_bytes_is_rejected(count: int) -> None:
     with pytest.raises(MalformedError):
         Cursor(struct.pack("<iii", count, 0, 0)).count(4)
+
+
+def test_a_count_of_channels_that_leaves_a_channel_without_its_size_is_rejected() -> None:
+    # id, 4 channels, and room for the sizes of 3
+    with pytest.raises(MalformedError, match="a count exceeds the datagram"):
+        read_analogs(Cursor(struct.pack("<iiiii", 1, 4, 0, 0, 0)), 1)
+    found = read_analogs(Cursor(struct.pack("<iiiiii", 1, 4, 0, 0, 0, 0)), 1)
+    assert found == (Analog(1, ((), (), (), ())),)
+
+
+def test_a_name_of_255_bytes_is_accepted_and_a_longer_one_is_refused() -> None:
+    longest = "é" * 127 + "n"  # 2 bytes each, and 1
+    model = ModelDefinition((MarkerSetDescription(longest, ()),))
+    assert decode(encode(model), (3, 0)) == model
+    with pytest.raises(ValueError, match="at most 255 bytes"):
+        encode(ModelDefinition((MarkerSetDescription(longest + "n", ()),)))
+    with pytest.raises(MalformedError, match="a name without an end"):
+        Cursor(b"n" * 256 + b"\0").text()
 
 
 def test_a_bitstream_before_2_5_is_refused_by_name() -> None:

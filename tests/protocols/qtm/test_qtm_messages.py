@@ -48,6 +48,17 @@ def test_the_published_frame_is_read_and_written_to_the_bit() -> None:
     assert qtm.encode(frame) == FRAME
 
 
+def test_events_have_the_numbers_of_the_vendors_document() -> None:
+    assert qtm.decode(bytes.fromhex("09000000 06000000 05")) == qtm.Event(5)
+    assert {event.value: event.name for event in qtm.QtmEvent} == {
+        1: "CONNECTED", 2: "CONNECTION_CLOSED", 3: "CAPTURE_STARTED", 4: "CAPTURE_STOPPED",
+        5: "FETCHING_FINISHED", 6: "CALIBRATION_STARTED", 7: "CALIBRATION_STOPPED",
+        8: "RT_FROM_FILE_STARTED", 9: "RT_FROM_FILE_STOPPED", 10: "WAITING_FOR_TRIGGER",
+        11: "CAMERA_SETTINGS_CHANGED", 12: "SHUTTING_DOWN", 13: "CAPTURE_SAVED",
+        14: "REPROCESSING_STARTED", 15: "REPROCESSING_STOPPED", 16: "TRIGGER",
+    }  # fmt: skip
+
+
 def test_discovery_and_its_answer_carry_big_endian_ports() -> None:
     assert qtm.encode(qtm.Discover(0x1234)) == bytes.fromhex("0a000000 07000000 1234")
     assert qtm.decode(bytes.fromhex("0a000000 07000000 1234")) == qtm.Discover(0x1234)
@@ -62,6 +73,8 @@ def test_discovery_and_its_answer_carry_big_endian_ports() -> None:
         (qtm.QtmTimecode(0, 0, 13 | 37 << 5 | 59 << 11 | 24 << 17), "13:37:59:24"),
         (qtm.QtmTimecode(0, 0, 13 | 37 << 5 | 59 << 11 | 24 << 17 | 80 << 22), "13:37:59:24.80"),
         (qtm.QtmTimecode(1, 26 | 327 << 7, 13 | 37 << 5 | 59 << 11 | 4 << 17), "26-327 13:37:59.4"),
+        (qtm.QtmTimecode(0, 0, 0x7FFF_FFFF), "31:63:63:31.511"),
+        (qtm.QtmTimecode(1, 0xFFFF, 0x001F_FFFF), "127-511 31:63:63.15"),
         (qtm.QtmTimecode(2, 1, 2), None),
         (qtm.QtmTimecode(9, 1, 2), None),
     ],
@@ -173,3 +186,15 @@ def test_a_skeleton_with_a_hostile_count_is_refused() -> None:
         changed = data.copy()
         struct.pack_into("<I", changed, at, 2**31)
         assert isinstance(qtm.decode(bytes(changed)), CorruptBytes)
+
+
+def test_a_packet_has_8_bytes_to_16_megabytes_and_a_type_of_one_byte() -> None:
+    sizes = {7: True, 8: False, 16 << 20: False, (16 << 20) + 1: True}
+    for size, broken in sizes.items():
+        stream = qtm.QtmStream()
+        stream.feed(struct.pack("<II", size, 0))
+        assert stream.broken is broken
+    for kind, broken in ((0xFF, False), (0x100, True)):
+        stream = qtm.QtmStream()
+        stream.feed(struct.pack("<II", 100, kind))
+        assert stream.broken is broken

@@ -117,6 +117,19 @@ def test_frames_of_another_type_are_skipped_and_no_corrupt_bytes() -> None:
     assert (decoder.messages, decoder.skipped, decoder.discarded) == (3, 2, 0)
 
 
+def test_a_frame_too_short_for_the_fields_is_corrupt_and_one_of_another_type_is_skipped() -> None:
+    kind = TableField(3, "u", 8)
+    form = BY_LENGTH._replace(message=(kind, 9), fields={0: FIELDS[0]})
+    short = form._replace(fields={})
+    decoder = FrameCodec(form)
+    mine = encode_frame(short, [], 6)
+    assert decoder.feed(mine) + decoder.flush() == [
+        CorruptBytes(6, "frame of 6 bytes is too short for the fields")
+    ]
+    assert decoder.feed(encode_frame(short._replace(message=(kind, 8)), [], 6)) == []
+    assert (decoder.skipped, decoder.discarded) == (1, 6)
+
+
 def test_sync_bytes_inside_a_frame_without_checksum_begin_none() -> None:
     form = UNCHECKED
     evil = encode_frame(form, [-0x55AB, 1, 1, 1, 0x55AA55AA, 1])
@@ -147,6 +160,37 @@ def test_blanks_separate_columns_with_an_empty_separator() -> None:
     (item,) = LineCodec(form).feed(b"  1.5\t7   2e-3 \r\n")
     assert isinstance(item, TableMessage)
     assert item.values == (1.5, 0.002)
+
+
+@pytest.mark.parametrize(
+    ("width", "line", "reason"),
+    [
+        (None, b"1,2", "2 columns"),
+        (None, b"1,2,3", None),
+        (None, b"1,2,3,4", None),
+        (4, b"1,2,3", "3 columns"),
+        (4, b"1,2,3,4", None),
+        (4, b"1,2,3,4,5", "5 columns"),
+    ],
+)
+def test_a_line_has_all_columns_of_its_fields_and_the_configured_number(
+    width: int | None, line: bytes, reason: str | None
+) -> None:
+    decoder = LineCodec(LineFormat({0: 0, 1: 2}, width=width))
+    found = decoder.feed(line + b"\r\n") + decoder.flush()
+    corrupt = [item.reason for item in found if isinstance(item, CorruptBytes)]
+    assert corrupt == ([] if reason is None else [reason])
+    assert decoder.messages == (reason is None)
+
+
+@pytest.mark.parametrize("size", [1024, 1025])
+def test_a_line_has_at_most_1024_bytes_before_its_end(size: int) -> None:
+    decoder = LineCodec(LineFormat({0: 0}))
+    decoder.feed(b"1".rjust(size))
+    assert decoder.pending == (size if size == 1024 else 0)
+    found = decoder.feed(b"\n2\n") + decoder.flush()
+    values = [item.values for item in found if isinstance(item, TableMessage)]
+    assert values == ([(1.0,), (2.0,)] if size == 1024 else [(2.0,)])
 
 
 def test_a_line_without_end_is_discarded_in_pieces() -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jointfit_protocols.table import FieldReader, TableField, overlaps, parse_type
+from jointfit_protocols.table import FieldReader, TableField, overlaps, parse_type, slot_quantities
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -93,6 +93,29 @@ def test_types_are_parsed_and_others_refused() -> None:
     assert parse_type("u3") == ("u", 3)
     assert parse_type("f64") == ("f", 64)
     assert [parse_type(text) for text in ("f20", "i65", "u0", "int16", "")] == [None] * 5
+
+
+def test_a_signed_number_has_at_least_two_bits() -> None:
+    assert parse_type("i1") is None
+    assert parse_type("i2") == ("i", 2)
+    assert parse_type("u1") == ("u", 1)
+
+
+def test_floats_have_16_32_or_64_bits() -> None:
+    found = [bits for bits in range(1, 100) if parse_type(f"f{bits}") is not None]
+    assert found == [16, 32, 64]
+
+
+def test_each_slot_belongs_to_one_quantity() -> None:
+    names = ["quaternion"] * 4 + ["rate"] * 3 + ["acceleration"] * 3 + ["magnetic"] * 3
+    names += ["time", "counter", "valid"]
+    assert [slot_quantities([slot]) for slot in range(17)] == [*((name,) for name in names), ()]
+
+
+def test_a_signed_number_of_63_bits_ignores_the_last_bit_of_its_bytes() -> None:
+    read = FieldReader([TableField(0, "i", 63)]).read
+    assert read(b"\x05" + bytes(6) + b"\x80", 0) == (5,)
+    assert read(b"\xfb" + b"\xff" * 6 + b"\x7f", 0) == (-5,)
 
 
 def test_overlaps_are_found_across_byte_orders() -> None:

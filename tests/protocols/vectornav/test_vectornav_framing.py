@@ -105,6 +105,20 @@ def test_an_output_has_the_documented_bytes() -> None:
     assert wire[-2:] == crc.to_bytes(2, "big")
 
 
+def test_fields_have_the_numbers_of_the_manual() -> None:
+    assert {field.name: field.value for field in Field} == {
+        "TIME_STARTUP": 0x000, "YAW_PITCH_ROLL": 0x003, "QUATERNION": 0x004,
+        "ANGULAR_RATE": 0x005, "ACCELERATION": 0x008, "MAGNETIC_AND_PRESSURE": 0x00A,
+        "TIME_GROUP_STARTUP": 0x100, "IMU_MAGNETIC_FIELD": 0x208, "IMU_ACCELERATION": 0x209,
+        "IMU_ANGULAR_RATE": 0x20A, "ATTITUDE_STATUS": 0x400, "ATTITUDE_QUATERNION": 0x402,
+    }  # fmt: skip
+    assert [register.value for register in registers.Register] == [1, 3, 4, 5, 6, 7, 9, 26, 75]
+    assert registers.BOTH_PORTS == 3
+    assert registers.decode_rotation([str(number) for number in range(10)]) == tuple(range(9))
+    assert registers.decode_rotation(["1"] * 8) is None
+    assert registers.decode_rotation(["x"] * 9) is None
+
+
 @pytest.mark.parametrize("group", [*range(7), 12])
 def test_field_sizes_equal_those_of_the_vendors_library(group: int) -> None:
     gnss = [8, 8, 2, 1, 1, 24, 24, 12, 12, 12, 4, 4, 2, 28, 2, 8]  # the last two: 17 and 18
@@ -143,6 +157,14 @@ def test_groups_and_fields_of_firmware_from_2023_leave_the_orientation_in_place(
             assert packet.values[packet.layout.places[Field.TIME_STARTUP]] == (7,)
             assert packet.values[packet.layout.places[Field.QUATERNION]] == (0.5, -0.5, 0.25, 0.75)
             assert packet.layout.header == head
+
+
+def test_messages_with_the_same_header_share_one_layout() -> None:
+    wires = [encode_binary(ORIENTATION | {Field.TIME_STARTUP: (time,)}) for time in (1, 2)]
+    first, second = decode(wires)[0]
+    assert isinstance(first, BinaryPacket)
+    assert isinstance(second, BinaryPacket)
+    assert first.layout is second.layout
 
 
 @given(binaries | texts, st.integers(0, 10_000), st.integers(0, 7))

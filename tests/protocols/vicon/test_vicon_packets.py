@@ -150,3 +150,22 @@ def test_after_another_block_the_stream_is_broken(header: tuple[int, int]) -> No
     assert found[0] == PING
     assert isinstance(found[1], CorruptBytes)
     assert stream.broken
+
+
+def test_ids_are_those_of_the_protocol() -> None:
+    assert [each.value for each in ObjectId] == [
+        1, 2, 5, 6, 8, 9, 23, 26, 36, 37, 39, 40, 42, 901,
+        100_001, 100_002, 100_003, 100_004,
+    ]  # fmt: skip
+    assert sorted(vicon.STATIC) == [1, 2, 28, 29, 37, 40, 28_001]
+    assert sorted(vicon.DYNAMIC) == [5, 6, 7, 8, 9, 23, 26, 36, 39, 901]
+    assert sorted(vicon.REQUESTS) == [100_005, 100_006, 100_007, 100_008]
+    assert not vicon.STATIC & vicon.DYNAMIC
+
+
+def test_a_packet_has_at_most_16_megabytes() -> None:
+    for size, broken in ((16 << 20, False), ((16 << 20) + 1, True)):
+        stream = vicon.ViconStream()
+        stream.feed(struct.pack("<II", 0x1A2B0001, size))
+        assert stream.broken is broken
+    assert vicon.TICKS_PER_S == 135_000_000

@@ -30,6 +30,7 @@ from jointfit_protocols.vrpn import (
     decode_announcement,
     encode,
     encode_announcement,
+    is_whole,
     whole_messages,
 )
 
@@ -159,6 +160,79 @@ def test_a_malformed_message_is_rejected_alone(data: bytes, reason: str) -> None
     assert isinstance(corrupt, CorruptBytes)
     assert reason in corrupt.reason
     assert after == SenderDescription(7, "after")
+
+
+def test_a_message_has_at_most_64_000_bytes() -> None:
+    longest = VrpnMessage(0, 1, 5, bytes(64_000 - 24))
+    assert decoded(encode(longest)) == [longest]
+    with pytest.raises(ValueError, match="64001 bytes"):
+        encode(longest._replace(body=bytes(64_000 - 23)))
+
+
+@pytest.mark.parametrize(
+    ("message", "accepted"),
+    [
+        (SenderDescription(1999, "x"), True),
+        (SenderDescription(0, "x"), True),
+        (SenderDescription(-1, "x"), False),
+        (TypeDescription(1, "n" * 255), True),
+        (TypeDescription(1, "n" * 256), False),
+        (UdpChannel(0xFFFF, "h"), True),
+        (UdpChannel(0x1_0000, "h"), False),
+        (UdpChannel(0, "h"), False),
+        (VrpnMessage(999_999, 1, 7, b""), True),
+    ],
+)
+def test_values_at_their_limits_are_accepted(message: VrpnContent, accepted: bool) -> None:
+    (found,) = decoded(encode(message))
+    assert (found == message) is accepted
+
+
+@pytest.mark.parametrize(
+    ("datagram", "found"),
+    [
+        (b"x 1024", Announcement("x", 1024)),
+        (b"x 65535\0", Announcement("x", 65_535)),
+        (b"h" * 255 + b" 4000", Announcement("h" * 255, 4000)),
+        (b"x 1023", CorruptBytes(6, "port outside 1024..65535")),
+        (b"h" * 256 + b" 4000", CorruptBytes(261, "no announcement of a client")),
+    ],
+)
+def test_announcements_at_their_limits(datagram: bytes, found: Announcement | CorruptBytes) -> None:
+    assert decode_announcement(datagram) == found
+
+
+def test_a_datagram_consists_of_whole_messages_or_is_rejected() -> None:
+    longest = encode(VrpnMessage(0, 1, 5, bytes(64_000 - 24)))
+    for datagram in (POSE, THIGH, POSE + THIGH, encode(VrpnMessage(0, 1, 5, b"")), longest):
+        assert is_whole(datagram)
+        assert not is_whole(datagram[:-1])
+        assert not is_whole(datagram + b"\0")
+        assert whole_messages(datagram) == len(datagram)
+    assert not is_whole(b"")
+    assert not is_whole(COOKIE)
+    assert not is_whole(struct.pack(">I", 23) + bytes(20))
+    assert not is_whole(struct.pack(">I", 64_001) + bytes(64_020))
+
+
+def test_defaults_are_those_of_the_reference_implementation() -> None:
+    assert encode(Cookie()) == COOKIE
+    assert (vrpn.DEFAULT_PORT, vrpn.MAJOR) == (3883, 7)
+    header = struct.unpack_from(">IIIiiI", encode(Ping(0, 2), IDS))
+    assert header == (24, 0, 0, 2, IDS[vrpn.PING], 0)
+    late = encode(Disconnect(), sequence=2**32 + 3, time_us=1_000_002)
+    assert struct.unpack_from(">IIIiiI", late) == (24, 1, 2, 0, -5, 3)
+
+
+def test_lost_bytes_are_reported_in_bounded_runs() -> None:
+    codec = VrpnCodec()
+    found = codec.feed(bytes(200_000))
+    assert codec.pending == len("vrpn: ver.")  # with one more byte it could be a cookie
+    found += codec.flush()
+    sizes = [item.discarded for item in found if isinstance(item, CorruptBytes)]
+    assert sum(sizes) == codec.discarded == 200_000
+    assert len(set(sizes[:-1])) == 1
+    assert max(sizes) == sizes[0]
 
 
 def test_the_number_of_a_type_belongs_to_the_peer() -> None:

@@ -16,8 +16,10 @@ from hypothesis import strategies as st
 from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.orientation import OrientationGate, canonical
 from jointfit_protocols.witmotion import (
+    BAUD_CODES,
     FRAME_BYTES,
     FULL_SCALE,
+    RATE_CODES,
     SAVE,
     UNLOCK,
     WitMotionCodec,
@@ -33,6 +35,7 @@ from jointfit_protocols.witmotion import (
     encode_time,
     rate_of,
     read_register,
+    registers_of,
     time_of,
     write_register,
 )
@@ -105,6 +108,12 @@ def test_the_variant_55_61_is_recognized_and_not_decoded(size: int) -> None:
     assert not any(isinstance(item, WitMotionFrame) for item in found)
 
 
+@pytest.mark.parametrize("before", range(30))
+def test_the_first_start_55_61_is_not_counted_wherever_it_is(before: int) -> None:
+    _, codec = decode([bytes(before) + b"\x55\x61" + bytes(18)])
+    assert codec.other_frames == 0
+
+
 def test_encode_refuses_what_the_format_does_not_allow() -> None:
     with pytest.raises(ValueError, match="0x61"):
         encode(0x61, bytes(8))
@@ -131,6 +140,59 @@ def test_a_clock_that_was_never_set_is_accepted_and_impossible_times_are_not() -
     for data in ("1a0d04050607", "1a0320050607", "1a0304180607", "1a0304053c07", "1a030405063c"):
         assert time_of(bytes.fromhex(data) + bytes(2)) is None
     assert time_of(bytes.fromhex("1a0304050607e803")) is None
+
+
+def test_the_limits_of_the_calendar_are_accepted() -> None:
+    last = bytes((99, 12, 31, 23, 59, 59)) + (999).to_bytes(2, "little")
+    assert time_of(last) == 36_525 * 86_400_000 - 1
+    assert encode_time(36_525 * 86_400_000 - 1) == last
+    assert time_of(bytes((0, 2, 29, 0, 0, 0, 0, 0))) == 59 * 86_400_000
+    assert time_of(bytes((0, 3, 1, 0, 0, 0, 0, 0))) == 60 * 86_400_000
+    assert time_of(bytes((1, 3, 1, 0, 0, 0, 0, 0))) == (366 + 59) * 86_400_000
+
+
+@pytest.mark.parametrize("year", [0, 1, 3, 4])
+def test_every_month_begins_on_the_day_of_the_calendar(year: int) -> None:
+    for month in range(1, 13):
+        first = datetime(2000 + year, month, 1)  # noqa: DTZ001 - the device has no time zone
+        ticks = (first - EPOCH).days * 86_400_000
+        assert time_of(bytes((year, month, 1, 0, 0, 0, 0, 0))) == ticks
+        assert encode_time(ticks) == bytes((year, month, 1, 0, 0, 0, 0, 0))
+
+
+def test_counts_beyond_16_bits_are_clipped() -> None:
+    assert counts_of(encode_counts((40_000, -40_000, 32_767, -32_768))) == (
+        32_767, -32_768, 32_767, -32_768,
+    )  # fmt: skip
+
+
+def test_numbers_are_those_of_the_protocol_pages() -> None:
+    assert [kind.value for kind in WitMotionFrameKind] == [*range(0x50, 0x5B), 0x5F]
+    assert [register.value for register in WitMotionRegister] == [
+        0x00, 0x02, 0x03, 0x04, 0x23, 0x24, 0x27, 0x2E, 0x69,
+    ]  # fmt: skip
+    assert RATE_CODES == {10: 6, 20: 7, 50: 8, 100: 9, 200: 11}
+    speeds = (4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600)
+    assert {speed: code for code, speed in enumerate(speeds, 1)} == BAUD_CODES
+    assert (UNLOCK.hex(), SAVE.hex()) == ("ffaa6988b5", "ffaa000000")
+    assert content_bits(0x50, 0x51, 0x59, 0x59) == 0x203
+    assert decode_command(UNLOCK + b"\0") is None
+
+
+def test_counts_have_the_units_of_the_protocol_pages() -> None:
+    data = encode_counts((32_767, -16_384, 1, 0))
+    assert acceleration_of(data) == pytest.approx([156.8 * 32_767 / 32_768, -78.4, 156.8 / 32_768])
+    turn = 34.906585039886591  # 2000 degrees/s
+    assert rate_of(data) == pytest.approx([turn * 32_767 / 32_768, -turn / 2, turn / 32_768])
+    assert registers_of(b"\1\0\2\0\3\0\xff\xff") == (1, 2, 3, 65_535)
+
+
+@pytest.mark.parametrize("kind", [0x4F, 0x50, 0x5F, 0x60])
+def test_kinds_are_0x50_to_0x5f(kind: int) -> None:
+    body = bytes((0x55, kind)) + bytes(8)
+    found, codec = decode([body + bytes((sum(body) & 0xFF,))])
+    assert codec.messages == (kind in range(0x50, 0x60))
+    assert isinstance(found[0], WitMotionFrame) == (kind in range(0x50, 0x60))
 
 
 @pytest.mark.skipif(not VECTORS, reason="vectors.json is not here")

@@ -104,6 +104,73 @@ def test_random_bytes_are_values_or_refused_by_their_length(
     assert (layout.read(noise) is None) == (len(noise) != layout.size)
 
 
+@pytest.mark.parametrize(
+    ("mode", "settings", "size"),
+    [
+        (0x0001, 0, 4),
+        (0x0001, 0x200, 6),
+        (0x0001, 0x300, 8),
+        (0x0002, 0, 36),
+        (0x0002, 0x10, 24),
+        (0x0002, 0x20, 24),
+        (0x0002, 0x40, 24),
+        (0x0002, 0x70, 0),
+        (0x0004, 0, 16),
+        (0x0004, 0x4, 12),
+        (0x0004, 0x8, 36),
+        (0x0004, 0x108, 36),
+        (0x0008, 0, 4),
+        (0x0008, 0x400, 2),
+        (0x0008, 0x800, 2),
+        (0x0008, 0xC00, 0),
+        (0x0010, 0, 12),
+        (0x0010, 0x300, 24),
+        (0x0020, 0, 12),
+        (0x0020, 0x200, 18),
+        (0x0800, 0, 1),
+        (0x1000, 0, 44),
+        (0x4000, 0, 20),
+        (0, 0x1, 2),
+        (0, 0x2, 12),
+        (0, 0x8000_0000, 0),
+    ],
+)
+def test_a_bit_of_mode_or_settings_adds_the_documented_bytes(
+    mode: int, settings: int, size: int
+) -> None:
+    assert MTDataLayout(mode, settings).size == size
+
+
+def test_fields_have_the_documented_order() -> None:
+    layout = MTDataLayout(sum(OutputMode), SAMPLE_COUNTER | UTC_TIME)
+    assert [(field.item, field.start, field.size, field.reals) for field in layout.fields] == [
+        (Item.ACCELERATION, 68, 12, 3),
+        (Item.RATE_OF_TURN, 80, 12, 3),
+        (Item.MAGNETIC_FIELD, 92, 12, 3),
+        (Item.QUATERNION, 104, 16, 4),
+        (Item.STATUS_BYTE, 148, 1, 0),
+        (Item.PACKET_COUNTER, 149, 2, 0),
+    ]
+    assert layout.size == 163
+
+
+def test_fields_without_a_value_are_zeros() -> None:
+    layout = MTDataLayout(CALIBRATED_QUATERNION, SAMPLE_COUNTER)
+    wire = layout.write({Item.PACKET_COUNTER: 3, Item.QUATERNION: (1.0, 0.0, 0.0, 0.0)})
+    assert wire == bytes(36) + struct.pack(">4fH", 1, 0, 0, 0, 3)
+
+
+def test_a_configuration_of_one_device_has_mode_and_settings() -> None:
+    def configuration(devices: int) -> bytes:
+        words = struct.pack(">H6xHI", devices, 0x0806, 0x8000_0001)
+        return bytes(96) + words + bytes(8)
+
+    assert mtdata.decode_device_configuration(configuration(1)) == (0x0806, 0x8000_0001)
+    assert mtdata.decode_device_configuration(configuration(2)) is None
+    assert mtdata.decode_device_configuration(configuration(0)) is None
+    assert mtdata.decode_device_configuration(configuration(1) + b"\0") is None
+
+
 def test_an_unknown_mode_is_refused() -> None:
     with pytest.raises(ValueError, match="is unknown"):
         MTDataLayout(0x0100, 0)
@@ -116,4 +183,6 @@ def test_replies_of_the_device_have_mode_settings_and_rate() -> None:
     assert rate_hz(struct.pack(">H", 1152), b"") == 100.0
     assert rate_hz(struct.pack(">H", 1152), b"\x00\x01") == 50.0
     assert rate_hz(b"\x00\x00", b"") is rate_hz(b"", b"") is None
+    assert rate_hz(b"\x01\x00\x00", b"") is rate_hz(b"\x01\x00", b"\x01") is None
+    assert decode_output_mode(bytes(3)) is decode_output_settings(bytes(5)) is None
     assert mtdata.COUNTS == 1 << 16

@@ -116,6 +116,45 @@ def test_every_item_is_known_to_the_codec() -> None:
     assert set(REALS) | set(COUNTS) | other == set(Item)
 
 
+def test_identifiers_are_those_of_the_manual() -> None:
+    assert [item.value for item in Item] == [
+        0x1010, 0x1020, 0x1060, 0x1070, 0x2010, 0x2020, 0x2030, 0x4010, 0x4020, 0x4030, 0x4810,
+        0x4820, 0x7010, 0x8020, 0x8030, 0xC020, 0xE010, 0xE020,
+    ]  # fmt: skip
+    families = {
+        0x08: (0x10,), 0x10: (0x10, 0x20, 0x30, 0x40, 0x50, 0x60, 0x70), 0x20: (0x10, 0x20, 0x30),
+        0x30: (0x10,), 0x40: (0x10, 0x20, 0x30, 0x40), 0x48: (0x10, 0x20), 0x50: (0x20, 0x30, 0x40),
+        0x70: (0x10, 0x20, 0x30), 0x80: (0x20, 0x30, 0x40), 0x88: (0x30, 0x40, 0x80, 0xA0),
+        0xA0: (0x10, 0x20), 0xB0: (0x10, 0x20), 0xC0: (0x20,), 0xD0: (0x10,),
+        0xE0: (0x10, 0x20, 0x40, 0x80, 0x90),
+    }  # fmt: skip
+    assert {group << 8 | kind for group, kinds in families.items() for kind in kinds} == set(
+        mtdata2.KNOWN_ITEMS
+    )
+    assert (mtdata2.FILTER_VALID, mtdata2.CLIPPING) == (0x2, 0x8_0000)
+
+
+def test_the_low_bits_of_an_identifier_are_precision_and_world() -> None:
+    assert mtdata2.real_id(Item.QUATERNION) == 0x2010
+    assert mtdata2.real_id(Item.QUATERNION, Precision.FIXED_12_20, "NED") == 0x2015
+    assert mtdata2.real_id(Item.QUATERNION, Precision.FIXED_16_32, "NWU") == 0x201A
+    assert mtdata2.real_id(Item.QUATERNION, Precision.FLOAT64) == 0x2013
+    assert mtdata2.world_of(0x201C) is None
+    assert mtdata2.decode_item(0x201C, bytes(16)) is None
+    assert (mtdata2.reals_in(0x2025), mtdata2.reals_in(0x202C)) == (9, None)
+    assert mtdata2.reals_in(Item.PACKET_COUNTER) is None
+
+
+def test_counts_and_positions_have_the_documented_sizes() -> None:
+    sizes = {Item.PACKET_COUNTER: 2, Item.SAMPLE_TIME_FINE: 4, Item.SAMPLE_TIME_COARSE: 4,
+             Item.STATUS_BYTE: 1, Item.STATUS_WORD: 4, Item.UTC_TIME: 12, Item.TRIGGER_IN2: 8,
+             Item.GNSS_PVT: 94}  # fmt: skip
+    for item, size in sizes.items():
+        assert mtdata2.decode_item(item, bytes(size)) is not None
+        assert mtdata2.decode_item(item, bytes(size - 1)) is None
+        assert mtdata2.decode_item(item, bytes(size + 1)) is None
+
+
 def test_utc_time_comes_back() -> None:
     time = UtcTime(123_456_789, 2019, 1, 20, 17, 2, 3, 7)
     wire = mtdata2.encode_item(Item.UTC_TIME, time)

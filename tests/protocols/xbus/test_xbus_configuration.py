@@ -96,7 +96,12 @@ def test_both_forms_of_the_device_id_read_as_on_the_label() -> None:
         ("MTi-3-8A7G6", 2**32),
         ("MTi-630-8A1G6", 2**32),
         ("MTi-680G-SK", 2**32),
+        ("MTi-10-2A5G4", 864_000_000),
+        ("MTi-20-2A5G4", 864_000_000),
         ("MTi-30-2A8G4", 864_000_000),
+        ("MTi-100-2A5G4", 864_000_000),
+        ("MTi-200-2A5G4", 864_000_000),
+        ("MTi-G-710-GNSS", 864_000_000),
         ("MTi-300-AHRS", 864_000_000),
         ("MTi-G-700-GPS", 864_000_000),
         ("Avior", None),
@@ -105,6 +110,21 @@ def test_both_forms_of_the_device_id_read_as_on_the_label() -> None:
 )
 def test_clock_wrap_follows_from_the_device_model(product: str, modulus: int | None) -> None:
     assert setup.fine_time_modulus(product) == modulus
+
+
+def test_errors_have_the_codes_of_the_manual() -> None:
+    texts = {0x03: "period", 0x04: "message", 0x1E: "output buffer", 0x20: "baud rate",
+             0x21: "parameter", 0x28: "device error"}  # fmt: skip
+    for code in range(256):
+        assert setup.error_text(code).startswith(
+            f"error 0x{code:02X}, {texts.get(code, 'unknown to this version')}"
+        )
+
+
+def test_a_tick_lasts_100_us_and_a_setting_may_leave_out_its_tail() -> None:
+    assert setup.TICK_NS == 100_000
+    assert setup.encode_sync([setup.SyncSetting(4, 2, 1)]).hex() == "04020100" + "0000" * 4
+    assert setup.MAX_RATE == 0xFFFF
 
 
 def test_a_filter_profile_is_a_code_or_a_label() -> None:

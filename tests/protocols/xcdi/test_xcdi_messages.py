@@ -31,6 +31,10 @@ from jointfit_protocols.xcdi import (
 if TYPE_CHECKING:
     from pathlib import Path
 
+SIZES = {
+    0x01: 1, 0x05: 4, 0x06: 2, 0x07: 8, 0x11: 4, 0x21: 8, 0x22: 6, 0x32: 6, 0x34: 6, 0x35: 6,
+}  # fmt: skip
+"""Length of the data of each message, bytes, in the manual."""
 shorts = st.integers(-32768, 32767)
 quaternions = st.tuples(shorts, shorts, shorts, shorts)
 can_frames = st.builds(
@@ -98,6 +102,45 @@ def test_any_bytes_are_counts_or_corrupt(data_id: DataId, data: bytes) -> None:
         counts = decode(data_id, data, byte_order)
         if not isinstance(counts, CorruptBytes):
             assert encode(data_id, counts, byte_order) == data
+
+
+def test_messages_have_the_identifiers_sizes_and_scales_of_the_manual() -> None:
+    assert [kind.value for kind in DataId] == list(SIZES)
+    for number, size in SIZES.items():
+        for length in range(9):
+            found = decode(DataId(number), bytes(length))
+            assert isinstance(found, CorruptBytes) == (length != size)
+    scales = {DataId.QUATERNION: 1 / 32767, DataId.EULER: 1 / 128, DataId.RATE_OF_TURN: 1 / 512,
+              DataId.ACCELERATION: 1 / 256, DataId.FREE_ACCELERATION: 1 / 256}  # fmt: skip
+    for kind in DataId:
+        assert layout(kind).scale == scales.get(kind, 1)
+    wire = encode(DataId.UTC, (26, 11, 29, 1, 2, 3, 9999))
+    assert wire.hex() == "1a0b1d010203" + "270f"
+    assert encode(DataId.SAMPLE_TIME, (258,), "little").hex() == "02010000"
+
+
+def test_a_block_moves_every_identifier() -> None:
+    assert XcdiIds() == (0x05, 0x06, 0x21, 0x11, 0x01, False)
+    assert id_block(0x100) == (0x105, 0x106, 0x121, 0x111, 0x101, False)
+    assert id_block(0x800, extended=True) == (0x805, 0x806, 0x821, 0x811, 0x801, True)
+    long = XcdiIds(0x7FF, None, 0x800, None, None)
+    assert long.by_id() == {(0x7FF, False): DataId.SAMPLE_TIME, (0x800, True): DataId.QUATERNION}
+
+
+def test_counts_beyond_full_scale_are_clipped() -> None:
+    assert quaternion_counts((1.1, -1.1, 1.00002, -1.00003)) == (32767, -32768, 32767, -32768)
+
+
+def test_an_open_group_is_discarded_by_a_flush() -> None:
+    decoder = XcdiCodec(XcdiIds())
+    groups_of(decoder, group(0, XcdiIds())[:1])
+    decoder.flush()
+    assert decoder.incomplete == 1
+    decoder.flush()
+    assert decoder.incomplete == 1
+    remote = CanFrame(0, 0x21, b"", remote=True)
+    assert decoder.feed(remote) is None
+    assert (decoder.foreign, decoder.messages) == (1, 1)
 
 
 def test_full_scale_is_rounded_not_overflowed() -> None:
@@ -188,12 +231,16 @@ def test_any_frames_give_groups_and_every_frame_is_accounted_for(frames: list[Ca
 
 
 def decided(
-    tick_ns: int, rate_hz: float = 100.0, count: int = 11, configured_hz: float | None = None
+    tick_ns: int,
+    rate_hz: float = 100.0,
+    count: int = 11,
+    configured_hz: float | None = None,
+    since_ns: int = 0,
 ) -> int | None:
     unit, answer = TickUnit(configured_hz or rate_hz), None
     for n in range(count):
         at = round(n * 1e9 / rate_hz)
-        answer = unit.feed((2**32 - 500 + round(at / tick_ns)) % 2**32, n, at)
+        answer = unit.feed((2**32 - 500 + round(at / tick_ns)) % 2**32, n, since_ns + at)
     return answer
 
 
@@ -223,6 +270,19 @@ def test_lost_groups_do_not_hide_the_unit_if_there_is_a_counter(tick_ns: int) ->
 def test_arrivals_over_two_seconds_correct_a_unit_that_a_wrong_rate_gave() -> None:
     assert decided(100_000, rate_hz=10.0, count=15, configured_hz=1000.0) == 1_000
     assert decided(100_000, rate_hz=10.0, count=25, configured_hz=1000.0) == 100_000
+
+
+def test_a_host_that_has_run_for_long_corrects_the_unit_as_fast() -> None:
+    month_ns = 30 * 86_400 * 10**9
+    for count, tick_ns in ((15, 1_000), (25, 100_000)):
+        found = decided(100_000, 10.0, count, configured_hz=1000.0, since_ns=month_ns)
+        assert found == tick_ns
+
+
+def test_a_sample_time_that_stands_still_has_no_unit() -> None:
+    unit = TickUnit(100.0)
+    assert {unit.feed(7, n, n * 10_000_000) for n in range(300)} == {None}
+    assert unit.ticks_per_s is None
 
 
 def test_a_clock_of_another_kind_is_not_forced_into_either_unit() -> None:
