@@ -52,10 +52,10 @@ class Mutant:
         assert text is not None
         return str(text)
 
-    def change(self) -> tuple[str, str]:
-        """Return the first line that differs, before and after the replacement."""
+    def change(self, source: str) -> tuple[str, str]:
+        """Return the first line that differs between the file and `source`, without indentation."""
         before = self.path.read_text(encoding="utf-8").splitlines()
-        after = self.source().splitlines()
+        after = source.splitlines()
         pairs = zip(before, after, strict=False)
         return next(
             ((one.strip(), other.strip()) for one, other in pairs if one != other), ("", "")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -20,24 +21,59 @@ def interval(killed: int, total: int) -> tuple[float, float]:
     return center - half, center + half
 
 
-def table_of(results: dict[str, Any]) -> str:
-    """Return the score of each package and of all as a table.
+def stored_outcomes(
+    drawn: list[dict[str, Any]], stored: list[dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Return the stored outcomes of an interrupted run that drew the same sample.
 
-    Equivalent mutants behave as the original, so no test can fail; they are not counted.
+    Raises
+    ------
+    SystemExit
+        The stored sample is another one, or the code changed.
+    """
+    keys = ("package", "file", "line")
+    if [[one[key] for key in keys] for one in stored] != [
+        [one[key] for key in keys] for one in drawn
+    ]:
+        sys.exit("--resume: the stored sample is another one, or the code changed: leave it out")
+    return stored
+
+
+def text_of(results: dict[str, Any]) -> str:
+    """Return the score of the stored sample for docs/reliability.md."""
+    tested = [one for one in results["mutants"] if one["outcome"]]
+    text = (
+        f"Stored are {len(tested)} of the {results['drawn']} mutants with seed {results['seed']}."
+    )
+    if len(tested) < results["drawn"]:
+        text += (
+            " The run was stopped before it tested the others, so packages that are not in the"
+            " table have no score yet."
+        )
+    return f"{text}\n\n{table_of(tested)}"
+
+
+def table_of(mutants: list[dict[str, Any]]) -> str:
+    """Return the score of each package and of all, as drawn and after the review, as a table.
+
+    In the score as drawn, every mutant counts that no test noticed. Equivalent mutants behave as
+    the original, so no test can fail; they and removed code do not count after the review.
     """
     rows = [
-        "| package | mutants | killed | survived | equivalent | score, % | interval, % |",
-        "| --- | --: | --: | --: | --: | --: | --: |",
+        "| package | mutants | killed | score, % | interval, % | killed later | equivalent |"
+        " removed | survived | score after review, % |",
+        "| --- | --: | --: | --: | --: | --: | --: | --: | --: | --: |",
     ]
-    mutants = results["mutants"]
     for package in [*sorted({one["package"] for one in mutants}), "all"]:
         counts = Counter(one["outcome"] for one in mutants if package in {one["package"], "all"})
-        judged = counts["killed"] + counts["survived"]
-        if judged:
-            low, high = interval(counts["killed"], judged)
-            rows.append(
-                f"| {package} | {counts.total()} | {counts['killed']} | {counts['survived']} | "
-                f"{counts['equivalent']} | {100 * counts['killed'] / judged:.0f} | "
-                f"{100 * low:.0f} to {100 * high:.0f} |"
-            )
+        killed, total = counts["killed"], counts.total()
+        low, high = interval(killed, total)
+        judged = total - counts["equivalent"] - counts["removed"]
+        reviewed = (killed + counts["killed later"]) / judged if judged else 1.0
+        rows.append(
+            f"| {package} | {total} | {killed} | {100 * killed / total:.0f} |"
+            f" {100 * low:.0f} to {100 * high:.0f} | {counts['killed later']} |"
+            f" {counts['equivalent']} | {counts['removed']} | {counts['survived']} |"
+            f" {100 * reviewed:.0f} |"
+        )
     return "\n".join(rows)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.mutation.score import interval, table_of
+from tests.mutation.score import interval, stored_outcomes, table_of, text_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,7 +31,7 @@ def test_mutants_change_the_code_and_no_annotation(tmp_path: Path) -> None:
     path = tmp_path / "source.py"
     path.write_text(SOURCE, encoding="utf-8")
     found = mutants.mutants_of(path)
-    changes = {mutant.change() for mutant in found}
+    changes = {mutant.change(mutant.source()) for mutant in found}
     assert ("return value + 1", "return value - 1") in changes
     assert (
         "if value is not None and value <= most:",
@@ -49,8 +49,28 @@ def test_interval_holds_the_share_and_narrows() -> None:
     assert interval(10, 10)[1] == pytest.approx(1.0)
 
 
-def test_equivalent_mutants_do_not_count() -> None:
-    outcomes = ["killed", "killed", "survived", "equivalent"]
-    results = {"mutants": [{"package": "timing", "outcome": outcome} for outcome in outcomes]}
-    row = table_of(results).splitlines()[-1]
-    assert row.startswith("| all | 4 | 2 | 1 | 1 | 67 |")
+def test_the_score_as_drawn_counts_every_mutant_that_survived_the_first_run() -> None:
+    outcomes = ["killed", "killed", "killed later", "equivalent", "removed", "survived"]
+    mutants = [{"package": "timing", "outcome": outcome} for outcome in outcomes]
+    row = table_of(mutants).splitlines()[-1]
+    assert row == "| all | 6 | 2 | 33 | 10 to 70 | 1 | 1 | 1 | 1 | 75 |"
+    text = text_of({"seed": 20, "drawn": 6, "mutants": mutants})
+    assert text.splitlines()[0] == "Stored are 6 of the 6 mutants with seed 20."
+
+
+def test_the_page_states_that_a_run_was_stopped() -> None:
+    mutants = [{"package": "timing", "outcome": outcome} for outcome in ("killed", "")]
+    text = text_of({"seed": 20, "drawn": 2, "mutants": mutants})
+    assert text.startswith("Stored are 1 of the 2 mutants with seed 20. The run was stopped")
+    assert text.splitlines()[-1].startswith("| all | 1 | 1 | 100 |")
+
+
+def test_an_interrupted_run_keeps_its_outcomes_only_for_the_same_sample() -> None:
+    drawn = [{"package": "timing", "file": "a.py", "line": line, "outcome": ""} for line in (3, 5)]
+    stored = [drawn[0] | {"outcome": "killed"}, drawn[1]]
+    assert [one["outcome"] for one in stored_outcomes(drawn, stored)] == ["killed", ""]
+
+    moved = [stored[0] | {"line": 4}, stored[1]]
+    for other in (moved, stored[:1], stored[::-1]):
+        with pytest.raises(SystemExit, match="another one, or the code changed"):
+            stored_outcomes(drawn, other)

@@ -119,7 +119,7 @@ def test_temporarily_exchanged_labels_are_removed_and_reported() -> None:
 
 def test_marker_missing_in_one_trial_is_reported_and_fitted_from_the_other() -> None:
     found = refined(changed(T1=slice(None)), replace(trial(), name="squat"))
-    assert any(note == "walk: T1 missing throughout" for note in found.notes)
+    assert any(note == "walk: T1 missing in every frame" for note in found.notes)
     assert not any(found.markers[5].held)
 
 

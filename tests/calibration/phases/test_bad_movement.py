@@ -132,11 +132,11 @@ def test_a_sensor_unplugged_from_the_start_is_refused_by_name(after: float) -> N
 
 def test_one_device_under_two_names_is_fitted_and_reported() -> None:
     found = fit(one_device_twice, still=True, learning=True)
-    told = [note for note in found.notes if "are identical in every frame" in note]
+    told = [note for note in found.notes if "do not move relative to each other" in note]
     assert [note[:9] for note in told] == ["S1 and S2"]
     figures = found.quality["holdout"]["segments"]["thigh"]
     assert figures["anchored"] < np.deg2rad(5.0)
-    assert not [note for note in fit().notes if "are identical" in note]
+    assert not [note for note in fit().notes if "do not move relative" in note]
 
 
 def test_a_reference_missing_two_fifths_of_the_time_is_enough() -> None:

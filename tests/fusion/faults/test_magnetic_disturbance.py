@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from jointfit_daemon.fusion.faults._magnetic_disturbance import (
     HeadingDifference,
     MagneticDisturbanceDetector,
+    _SmoothedDifference,
 )
 
 LEG = (("S1", "S2"), ("S3", "S4"))
@@ -101,3 +102,18 @@ def test_corrections_start_and_end_without_a_jump() -> None:
         before = now
     assert detector.corrections == {}
     assert detector.ambiguity == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(("pause_ns", "continues"), [(500_000_000, True), (500_000_001, False)])
+def test_a_difference_is_smoothed_across_half_a_second_without_data(
+    pause_ns: int, continues: bool
+) -> None:
+    smoothed = _SmoothedDifference()
+    smoothed.update(0, 1.0, SD)
+    smoothed.update(pause_ns, 1.0, SD)
+    assert (smoothed.angle > 0.0) is continues
+
+
+def test_a_sensor_without_a_known_deviation_counts_as_undisturbed() -> None:
+    detector = detector_after(LEG, {"S2": 40.0})
+    assert detector.outlier("S1", "S2") == detector.outlier("other", "S2") is not None

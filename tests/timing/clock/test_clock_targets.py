@@ -36,6 +36,7 @@ def test_clocks_keep_their_targets(figures: clocks.Figures) -> None:
     assert missed == []
 
 
+@pytest.mark.alone
 def test_an_update_costs_microseconds() -> None:
     (figure,) = clocks.cost(NOWHERE)
     assert figure.value <= 5 * figure.maximum  # a busy machine of any kind; the bench says how many

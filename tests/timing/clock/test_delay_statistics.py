@@ -30,6 +30,15 @@ def test_bins_are_in_order(delay: int, more: int) -> None:
     assert bin_of(delay) <= bin_of(delay + more)
 
 
+def test_every_delay_has_a_bin_even_a_day_or_a_negative_one() -> None:
+    minute = DelayStatistics()
+    for delay in (86_400 * S, -5):
+        minute.feed(0, delay)
+    assert bin_of(-5) == bin_of(0) == 0
+    assert minute.delays is not None
+    assert minute.delays.max_ns == 86_400 * S
+
+
 def test_delays_older_than_a_minute_are_excluded() -> None:
     minute = DelayStatistics()
     minute.feed(0, 10 * S)

@@ -9,6 +9,7 @@ import pytest
 
 from jointfit_daemon.model import ClockEcho, TickClock
 from jointfit_daemon.timing.clock import DeviceClock, Edge, SyncLine
+from jointfit_daemon.timing.clock._direct_time import EDGE_SD_NS, SyncEdgeFit
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -171,3 +172,26 @@ def test_a_declared_clock_that_arrivals_contradict_is_an_event_and_not_used() ->
     assert clock.state == "passive"
     assert [news.kind for news in clock.news] == ["warning", "clock"]
     assert "sync time differs" in clock.news[0].text
+
+
+class HostClock:
+    """A reference clock without error."""
+
+    epoch, slope, settled = 0, 0.0, True
+
+    def host_ns(self, u: int) -> int:
+        return u
+
+    def sigma_at(self, u: int) -> float:  # noqa: ARG002 - the same at all times
+        return 0.0
+
+
+@pytest.mark.parametrize("grain_ns", [0.0, 10_000.0, 1_000_000.0])
+def test_sigma_of_a_sync_fit_contains_the_quantization_of_the_ticks(grain_ns: float) -> None:
+    """The error of rounding to a tick is uniform; its variance is the tick squared over 12."""
+    fit, edges = SyncEdgeFit(HostClock(), grain_ns), 9
+    for k in range(edges):
+        fit.feed(k * S, START + k * S)
+    middle = edges // 2 * S  # there, the slope does not contribute
+    expected = np.sqrt((EDGE_SD_NS**2 + grain_ns**2 / 12) / edges)
+    assert fit.sigma_at(middle) == pytest.approx(expected, rel=1e-6)
