@@ -14,42 +14,34 @@ import json
 import math
 import os
 import struct
+import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from jointfit_daemon.calibration.record import CalibrationStore
 from jointfit_daemon.config import load_rig
-from jointfit_daemon.tools.child_processes import daemon
-from jointfit_protocols.xbus.mtdata2 import Item
-from jointfit_simulators.devices import XbusDevice, XbusDeviceOptions
+from jointfit_daemon.tools.child_processes import ChildProcess, daemon
 from tests.broker_fixture import chosen_broker
-from tests.endurance.slopes import RESULTS, slope_of, table_of
+from tests.compiled_variant import is_current
+from tests.endurance.sensors import RATE_HZ, SENSORS, Movement
+from tests.endurance.slopes import ERROR, RESULTS, faults_of, slope_of, table_of, warning_of
 from tests.faults.run import PAGE, render, stored
 from tests.limb_model.plain_calibration import plain_calibration
 from tests.system.station import OUTCOMES, Listener, broker
 
 FOLDER = Path(__file__).parent
+ROOT = FOLDER.parents[1]
 BASE = "jointfit/endurance"
-SENSORS = ("S1", "S2", "S3", "S4")
-RATE_HZ = 400
-"""Sample rate of each sensor in accelerated time, Hz."""
-PERIOD_NS = 1_000_000_000 // RATE_HZ
-WAKE_S = 0.01
-"""Time between two transmissions of the due samples, s of accelerated time."""
-TURN_RAD_S = 0.8
-"""Angular frequency of the movement, rad/s; its amplitude is 1 rad."""
 INTERVALS = 240
 """Number of measurements of a run."""
-ERROR = "median error of poses, deg"
-MOST_ERROR_DEG = 3.0
-"""Largest median error of an interval, deg. A batch of samples arrives late by its duration."""
+COUNTERS = ("received", "lost", "late", "dropped", "restarts", "reconnects")
 RIG = """
 [rig]
 name = "endurance"
+output_rate_hz = 50
 [chain]
 joints = ["hip", "knee"]
 segments = ["thigh"]
@@ -75,67 +67,24 @@ silence_s = {silence_s}
 """
 
 
-@dataclass
-class Movement:
-    """Sensors that move in accelerated time."""
-
-    folder: Path
-    factor: int
-    begin_ns: int = field(default_factory=time.monotonic_ns)
-    number: int = 0
-
-    def __post_init__(self) -> None:
-        outputs = (*XbusDeviceOptions().outputs[:-1], (Item.QUATERNION, RATE_HZ))
-        options = XbusDeviceOptions(outputs=outputs)
-        self.devices = [XbusDevice(self.folder / name, options=options) for name in SENSORS]
-        self.unix_ns = time.time_ns() - self.begin_ns
-
-    def now_ns(self) -> int:
-        """Return the accelerated time, ns."""
-        return self.begin_ns + (time.monotonic_ns() - self.begin_ns) * self.factor
-
-    def angle(self, t_ns: int) -> float:
-        """Return the angle of all sensors at an accelerated time, rad."""
-        return math.sin(TURN_RAD_S * (t_ns - self.begin_ns) * 1e-9)
-
-    def error_deg(self, pose: dict[str, Any]) -> float | None:
-        """Return the error of a pose; None without an orientation."""
-        q = pose["segments"]["thigh"]["q"]
-        if q is None:
-            return None
-        angle = 2.0 * math.atan2(q[1], q[0])
-        truth = self.angle(pose["t_us"] * 1000 - self.unix_ns)
-        return abs(math.degrees(math.remainder(angle - truth, 2.0 * math.pi)))
-
-    async def run(self) -> None:
-        """Send samples until cancelled."""
-        serving = [asyncio.create_task(device.run()) for device in self.devices]
-        try:
-            while True:
-                due = (self.now_ns() - self.begin_ns) // PERIOD_NS
-                while self.number < due:
-                    self.number += 1
-                    t_ns = self.begin_ns + self.number * PERIOD_NS
-                    half = self.angle(t_ns) / 2
-                    q = (math.cos(half), math.sin(half), 0.0, 0.0)
-                    for device in self.devices:
-                        device.push(t_ns - self.begin_ns, q)
-                await asyncio.sleep(WAKE_S / self.factor)
-        finally:
-            for task in serving:
-                task.cancel()
-            await asyncio.wait(serving)
-            for device in self.devices:
-                device.unplug()
+def error_deg(pose: dict[str, Any], movement: Movement, unix_ns: int) -> float | None:
+    """Return the error of a pose; None without an orientation. The movement begins at `unix_ns`."""
+    q = pose["segments"]["thigh"]["q"]
+    if q is None:
+        return None
+    angle = 2.0 * math.atan2(q[1], q[0])
+    truth = movement.angle(pose["t_us"] * 1000 - unix_ns)
+    return abs(math.degrees(math.remainder(angle - truth, 2.0 * math.pi)))
 
 
 def process_values(pid: int, counts: Path) -> dict[str, float]:
     """Return the values that the kernel and the process count."""
     place = Path(f"/proc/{pid}")
-    tasks, objects = struct.unpack("<qq", counts.read_bytes())
+    tasks, objects, allocated = struct.unpack("<qqq", counts.read_bytes())
     pages = int((place / "statm").read_text("ascii").split()[1])
     return {
         "memory, MB": pages * os.sysconf("SC_PAGE_SIZE") / 1e6,
+        "memory allocated by malloc, MB": allocated / 1e6,
         "file descriptors": len(list((place / "fd").iterdir())),
         "threads": len(list((place / "task").iterdir())),
         "asyncio tasks": tasks,
@@ -143,10 +92,14 @@ def process_values(pid: int, counts: Path) -> dict[str, float]:
     }
 
 
-def daemon_values(listener: Listener, movement: Movement) -> dict[str, float]:
+def daemon_values(listener: Listener, movement: Movement, unix_ns: int) -> dict[str, float]:
     """Return the values in the messages of an interval."""
-    poses, health = listener.poses, listener.latest["bridge/health"]
-    errors = sorted(e for e in map(movement.error_deg, poses) if e is not None)
+    health = listener.latest["bridge/health"]
+    errors = sorted(
+        error
+        for pose in listener.poses
+        if (error := error_deg(pose, movement, unix_ns)) is not None
+    )
     devices = [health["devices"][name] for name in SENSORS]
     return {
         ERROR: errors[len(errors) // 2] if errors else math.nan,
@@ -158,11 +111,41 @@ def daemon_values(listener: Listener, movement: Movement) -> dict[str, float]:
     }
 
 
-async def measure(
-    folder: Path, port: int, samples: int, factor: int, seconds: float
-) -> list[dict[str, float]]:
-    """Run until `samples` were received or `seconds` have passed; return the measurements."""
-    movement = Movement(folder, factor)
+def daemon_process(folder: Path, movement: Movement, *, compiled: bool) -> ChildProcess:
+    """Return the daemon in accelerated time, on the compiled modules or on the sources.
+
+    Raises
+    ------
+    SystemExit
+        The compiled modules are missing or older than the sources.
+    """
+    child = daemon(folder, folder / "rig.toml")
+    paths = [str(FOLDER / "fast_time")]
+    if compiled:
+        if not is_current():
+            sys.exit("build/compiled does not contain the current sources: run `make compiled`")
+        paths.append(str(ROOT / "build" / "compiled"))
+    counts = folder / "counts"
+    counts.write_bytes(bytes(24))
+    child.environment |= {
+        "PYTHONPATH": os.pathsep.join(paths),
+        "PYTHONSAFEPATH": "1",  # the current folder contains the sources
+        "ENDURANCE": f"{counts}:{movement.factor}:{movement.begin_ns}",
+    }
+    return child
+
+
+def variant_of(child: ChildProcess) -> str:
+    """Return the form of the modules that the daemon imports: compiled or pure."""
+    version = subprocess.run(
+        [*child.arguments[:3], "--version"], env=os.environ | child.environment,
+        capture_output=True, text=True, check=True,
+    ).stdout  # fmt: skip
+    return version.partition("(")[2].rstrip(")\n")
+
+
+def write_rig(folder: Path, port: int, factor: int) -> None:
+    """Write rig.toml and a calibration of its chain."""
     text = RIG.format(port=port, base=BASE, folder=folder, health_s=5)
     # The time limit is a second of real time, because this machine pauses processes for tenths of a
     # second.
@@ -170,43 +153,64 @@ async def measure(
     text += "".join(IMU.format(name=name, **line) for name in SENSORS)
     (folder / "rig.toml").write_text(text, "utf-8")
     rig = load_rig(folder / "rig.toml")
-    CalibrationStore(folder / "state" / "calibrations", rig.calibration_store).save(
-        plain_calibration(rig.chain)
-    )
-    counts = folder / "counts"
-    counts.write_bytes(bytes(16))
-    child = daemon(folder, folder / "rig.toml")
-    child.environment |= {
-        "PYTHONPATH": str(FOLDER / "fast_time"),
-        "ENDURANCE": f"{counts}:{factor}:{movement.begin_ns}",
-    }
+    store = CalibrationStore(folder / "state" / "calibrations", rig.calibration_store)
+    store.save(plain_calibration(rig.chain))
+
+
+async def measure(
+    folder: Path, port: int, options: argparse.Namespace
+) -> tuple[list[dict[str, float]], dict[str, int], str]:
+    """Run until the samples were received or the time has passed.
+
+    Returns the measurements, the sums of the counters of all sensors, and the variant of the
+    daemon.
+    """
+    movement = Movement(options.factor)
+    unix_ns = time.time_ns() - time.monotonic_ns() + movement.begin_ns
+    write_rig(folder, port, options.factor)
+    words = [str(folder), str(movement.factor), str(movement.begin_ns)]
+    command = [sys.executable, "-m", "tests.endurance.sensors", *words]
+    sensors = ChildProcess("sensors", command, folder, {})
+    child = daemon_process(folder, movement, compiled=options.compiled)
     listener = Listener(broker(port, BASE), ("pose", "bridge/health", "device/+/availability"))
-    tasks = [asyncio.create_task(part.run()) for part in (movement, listener)]
+
+    def are_settled() -> bool:
+        sensors.check()
+        child.check()
+        health = listener.latest.get("bridge/health", {"devices": {}})["devices"]
+        return health.keys() >= set(SENSORS) and all(d["skew_ppm"] for d in health.values())
+
+    task = asyncio.create_task(listener.run())
     found: list[dict[str, float]] = []
+    seconds = min(60.0 * options.minutes, options.samples / movement.samples_per_s)
     try:
-        async with child:
-            await listener.connected(SENSORS)
-            await listener.health(lambda devices: all(d["skew_ppm"] for d in devices.values()))
-            until_s = time.monotonic() + seconds
-            per_s = RATE_HZ * len(SENSORS) * factor
-            pause_s = min(seconds, samples / per_s) / INTERVALS
-            while time.monotonic() < until_s and received(listener) < samples:
+        async with sensors, child:
+            await listener.until(are_settled)
+            assert child.process is not None
+            until_s = time.monotonic() + 60.0 * options.minutes
+            while time.monotonic() < until_s and received(listener) < options.samples:
                 listener.poses.clear()
-                await asyncio.sleep(pause_s)
+                await asyncio.sleep(seconds / INTERVALS)
+                sensors.check()
                 child.check()
-                assert child.process is not None
                 row = {"samples": float(received(listener))}
-                row |= process_values(child.process.pid, counts)
-                row |= daemon_values(listener, movement)
+                row |= process_values(child.process.pid, folder / "counts")
+                row |= daemon_values(listener, movement, unix_ns)
                 if not any(map(math.isnan, row.values())):  # otherwise, this machine paused
                     found.append(row)
-            check_counters(listener, movement)
+                    append(row, options.out)
     finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.wait(tasks)
-        print(child.tail(), file=sys.stderr)
-    return found
+        task.cancel()
+        await asyncio.wait([task])
+        print(sensors.tail(), child.tail(), sep="\n", file=sys.stderr)
+    return found, counters_of(listener), variant_of(child)
+
+
+def append(row: dict[str, float], out: Path | None) -> None:
+    """Append a measurement to the file, if there is one."""
+    if out is not None:
+        with out.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
 
 
 def received(listener: Listener) -> int:
@@ -215,18 +219,17 @@ def received(listener: Listener) -> int:
     return sum(devices[name]["received"] for name in SENSORS)
 
 
-def check_counters(listener: Listener, movement: Movement) -> None:
-    """Require that every sample has an outcome; print the interruptions by this machine."""
-    interruptions = 0
-    for name in SENSORS:
-        device = listener.latest["bridge/health"]["devices"][name]
-        outcomes = sum(device[key] for key in OUTCOMES) + device["pending"]
-        assert outcomes == device["received"], (name, device)
-        interruptions += device["restarts"] + device["reconnects"]
-    print(f"{movement.number} samples sent by each sensor, {interruptions} reconnects or restarts")
+def counters_of(listener: Listener) -> dict[str, int]:
+    """Return the sums of the counters of all sensors, and of the samples without an outcome."""
+    devices = [listener.latest["bridge/health"]["devices"][name] for name in SENSORS]
+    sums = {key: sum(device[key] for device in devices) for key in COUNTERS}
+    outcomes = sum(device[key] for device in devices for key in (*OUTCOMES, "pending"))
+    return sums | {"unaccounted": sum(device["received"] for device in devices) - outcomes}
 
 
-def results_of(found: list[dict[str, float]], factor: int) -> dict[str, Any]:
+def results_of(
+    found: list[dict[str, float]], counters: dict[str, int], variant: str, factor: int
+) -> dict[str, Any]:
     """Return the slopes of a run, for the page."""
     samples = [row["samples"] for row in found]
     names = [name for name in found[0] if name != "samples"]
@@ -234,7 +237,9 @@ def results_of(found: list[dict[str, float]], factor: int) -> dict[str, Any]:
     return {
         "samples": int(samples[-1]),
         "factor": factor,
+        "variant": variant,
         "measurements": len(found),
+        "counters": counters,
         "worst_error_deg": round(max(row[ERROR] for row in found[len(found) // 4 :]), 2),
         "slopes": {
             name: {"mean": s.mean, "per_million": s.per_million, "half_width": s.half_width}
@@ -243,39 +248,31 @@ def results_of(found: list[dict[str, float]], factor: int) -> dict[str, Any]:
     }
 
 
-def faults_of(results: dict[str, Any]) -> list[str]:
-    """Return the values that grow or are wrong."""
-    faults = [
-        f"{name} has a slope of {slope['per_million']:+.3g} ± {slope['half_width']:.2g} per million"
-        for name, slope in results["slopes"].items()
-        if abs(slope["per_million"]) > slope["half_width"]
-    ]
-    if results["worst_error_deg"] > MOST_ERROR_DEG:
-        faults.append(f"{ERROR}: {results['worst_error_deg']}, limit {MOST_ERROR_DEG:g}")
-    return faults
-
-
 def main() -> int:
-    """Run the test; return 1 if a value has a slope."""
+    """Run the test; return 1 if a value has a slope or is wrong."""
     parser = argparse.ArgumentParser(prog="make endurance", description=__doc__)
     parser.add_argument("--samples", type=int, default=50_000_000, help="samples of all sensors")
     parser.add_argument("--factor", type=int, default=10, help="times real time")
     parser.add_argument("--minutes", type=float, default=600.0, help="longest real time")
-    parser.add_argument("--out", type=Path, help="file for the measurements, JSON")
+    parser.add_argument("--compiled", action="store_true", help="the modules of `make compiled`")
+    parser.add_argument("--out", type=Path, help="file for the measurements, JSON lines")
     parser.add_argument("--store", action="store_true", help="store the slopes for the page")
     options = parser.parse_args()
+    for name in ("samples", "factor", "minutes"):
+        if not getattr(options, name) > 0:
+            parser.error(f"--{name}: expected a number above 0, got {getattr(options, name)}")
     with tempfile.TemporaryDirectory() as name:
         chosen = chosen_broker()(Path(name))
         chosen.start()
         try:
-            limits = options.samples, options.factor, 60.0 * options.minutes
-            found = asyncio.run(measure(Path(name), chosen.port, *limits))
+            found, counters, variant = asyncio.run(measure(Path(name), chosen.port, options))
         finally:
             chosen.stop()
-    if options.out is not None:
-        options.out.write_text(json.dumps(found) + "\n", "utf-8")
-    results = results_of(found, options.factor)
+    results = results_of(found, counters, variant, options.factor)
     print(table_of(results))
+    print(", ".join(f"{count} {key}" for key, count in counters.items()))
+    if warning := warning_of(results["samples"]):
+        print(f"warning: {warning}")
     if options.store:
         RESULTS.write_text(json.dumps(results, indent=1, sort_keys=True) + "\n", "utf-8")
         PAGE.write_text(render(stored()), "utf-8")
@@ -284,4 +281,5 @@ def main() -> int:
     return 1 if faults else 0
 
 
-sys.exit(main())
+if __name__ == "__main__":
+    sys.exit(main())

@@ -21,6 +21,14 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 RESULTS = Path(__file__).parent / "results.json"
+ERROR = "median error of poses, deg"
+MOST_ERROR_DEG = 3.0
+"""Largest median error of an interval, deg. A batch of samples arrives late by its duration."""
+MOST_MISSING = 0.01
+"""Largest share of samples that are lost or dropped. A larger share shows that the daemon is too
+slow for the factor, so the run has not tested normal operation."""
+LEAST_SAMPLES = 10_000_000
+"""Number of samples below which buffers are still filling, so that slopes prove nothing."""
 BLOCKS = 12
 """Number of quartiles to which the line is fitted."""
 WARM_UP = 0.25
@@ -82,3 +90,49 @@ def table_of(results: dict[str, Any]) -> str:
         interval = f"{slope['per_million']:+.3g} ± {slope['half_width']:.2g}"
         rows.append(f"| {name} | {slope['mean']:.4g} | {interval} |")
     return "\n".join(rows)
+
+
+def outcomes_of(results: dict[str, Any]) -> str:
+    """Return the counters of a run and its largest error as sentences."""
+    counters = results["counters"]
+    received = f"{counters['received']:,}".replace(",", " ")
+    return (
+        f"Of {received} samples that the daemon received in all, {counters['late']} were late,"
+        f" {counters['dropped']} were dropped, and {counters['unaccounted']} had no outcome;"
+        f" {counters['lost']} more were lost on the lines."
+        f" Sensors were reconnected {counters['reconnects']} times."
+        f" The largest median error of the poses in an interval was"
+        f" {results['worst_error_deg']:g}°."
+        f" Result: {'; '.join(faults_of(results)) or 'nothing grows'}."
+    )
+
+
+def faults_of(results: dict[str, Any]) -> list[str]:
+    """Return the values that grow or are wrong."""
+    faults = [
+        f"{name} has a slope of {slope['per_million']:+.3g} ± {slope['half_width']:.2g} per million"
+        for name, slope in results["slopes"].items()
+        if abs(slope["per_million"]) > slope["half_width"]
+    ]
+    if results["worst_error_deg"] > MOST_ERROR_DEG:
+        faults.append(f"{ERROR}: {results['worst_error_deg']}, limit {MOST_ERROR_DEG:g}")
+    counters = results["counters"]
+    if counters["unaccounted"]:
+        faults.append(f"{counters['unaccounted']} samples have no outcome, expected 0")
+    missing = counters["lost"] + counters["dropped"]
+    if missing > MOST_MISSING * counters["received"]:
+        faults.append(
+            f"{missing} samples were lost or dropped, {counters['received']} received, expected at"
+            f" most {MOST_MISSING:.0%}: choose a smaller --factor than {results['factor']}"
+        )
+    return faults
+
+
+def warning_of(samples: int) -> str:
+    """Return a warning that a run is too short to judge growth; an empty text if it is not."""
+    if samples >= LEAST_SAMPLES:
+        return ""
+    return (
+        f"{samples} samples are too few to distinguish growth from buffers that fill: use at least"
+        f" {LEAST_SAMPLES}"
+    )

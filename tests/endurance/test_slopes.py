@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
-from tests.endurance.slopes import slope_of
+from tests.endurance.slopes import ERROR, faults_of, outcomes_of, slope_of, warning_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -61,3 +61,49 @@ def test_a_constant_has_no_slope() -> None:
 def test_a_short_run_is_refused() -> None:
     with pytest.raises(ValueError, match="at least 24"):
         slope_of(SAMPLES[:20], SAMPLES[:20], 1)
+
+
+def results(**changed: Any) -> dict[str, Any]:
+    """Return the results of a run without faults, or with changed values."""
+    counters = {
+        "received": 1000,
+        "lost": 6,
+        "late": 90,
+        "dropped": 4,
+        "unaccounted": 0,
+        "reconnects": 0,
+    }
+    slopes = {"memory, MB": {"mean": 80.0, "per_million": -0.1, "half_width": 0.1}}
+    sound = {"factor": 12, "worst_error_deg": 0.3, "counters": counters, "slopes": slopes}
+    return sound | changed
+
+
+def test_a_run_without_growth_has_no_fault() -> None:
+    assert faults_of(results()) == []
+
+
+@pytest.mark.parametrize(
+    ("changed", "part"),
+    [
+        ({"slopes": {"threads": {"per_million": 0.3, "half_width": 0.2}}}, "threads has a slope"),
+        ({"worst_error_deg": 3.1}, f"{ERROR}: 3.1, limit 3"),
+        ({"counters": results()["counters"] | {"unaccounted": 1}}, "1 samples have no outcome"),
+        ({"counters": results()["counters"] | {"lost": 7}}, "smaller --factor than 12"),
+    ],
+)
+def test_growth_wrong_poses_and_missing_samples_are_faults(
+    changed: dict[str, Any], part: str
+) -> None:
+    (fault,) = faults_of(results(**changed))
+    assert part in fault
+
+
+def test_a_run_below_ten_million_samples_is_too_short_to_judge_growth() -> None:
+    assert "9999999 samples are too few" in warning_of(9_999_999)
+    assert warning_of(10_000_000) == ""
+
+
+def test_the_page_names_what_grew_in_the_stored_run() -> None:
+    growing = results(slopes={"threads": {"per_million": 0.3, "half_width": 0.2}})
+    assert "threads has a slope of +0.3 ± 0.2 per million" in outcomes_of(growing)
+    assert "nothing grows" in outcomes_of(results())

@@ -15,7 +15,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from jointfit_daemon.calibration.record import CalibrationStore
 from jointfit_daemon.config import load_rig
@@ -94,6 +94,10 @@ silence_s = 30
 """
 
 
+Sources: TypeAlias = "tuple[tuple[int, Callable[[float], object]], ...]"
+"""Rate of each source, Hz, and the function that sends its sample at a time, s."""
+
+
 class Inputs:
     """Simulated devices that send together, and pause together."""
 
@@ -105,6 +109,7 @@ class Inputs:
         options = XbusDeviceOptions(outputs=OUTPUTS)
         self.imus = {name: XbusDevice(folder / name, options=options) for name in SERIAL}
         self.sending = True
+        self._began_ns = time.monotonic_ns()
         self._places = {
             name: (0.01 * k, 0.2 * (k % 3), 0.3 + 0.1 * (k % 2)) for k, name in enumerate(MARKERS)
         }
@@ -119,9 +124,9 @@ class Inputs:
         for device in self.imus.values():
             device.push(round(t_s * 1e9), _turned(t_s))
 
-    def _push_frame(self, _: float) -> None:
+    def _push_frame(self, t_s: float) -> None:
         body = {"Thigh": ((0.0, 0.0, 0.3), (1.0, 0.0, 0.0, 0.0))}
-        self.server.push(time.monotonic_ns(), self._places, body)
+        self.server.push(self._began_ns + round(t_s * 1e9), self._places, body)
 
     async def run(self) -> None:
         """Serve the devices and send until cancelled."""
@@ -130,24 +135,31 @@ class Inputs:
             parts = (self.server, self.bus, *self.imus.values())
             for part in parts:
                 tasks.create_task(part.run())
-            sources: tuple[tuple[int, Callable[[float], object]], ...] = (
+            sources: Sources = (
                 (RATES_HZ["S1"], self._push_imus),
                 (RATES_HZ["S5"], lambda t_s: self.can.push(round(t_s * 1e9), _turned(t_s))),
                 (STRANGERS_HZ, lambda _: self.bus.send([STRANGER])),
                 (RATES_HZ["mocap"], self._push_frame),
             )
-            for rate_hz, push in sources:
-                tasks.create_task(self._send(rate_hz, push))
+            tasks.create_task(self._send(sources))
 
-    async def _send(self, rate_hz: int, push: Callable[[float], object]) -> None:
-        """Send at a rate; the time of the devices passes during a pause, too."""
-        number, began_s = 0, time.monotonic()
+    async def _send(self, sources: Sources) -> None:
+        """Send at the rates of the sources; the time of the devices passes during a pause, too.
+
+        Samples and frames are sent in the order of their times, as on a bus, also if this process
+        was paused and many are due.
+        """
+        numbers = [0] * len(sources)
         while True:
-            due = (time.monotonic() - began_s) * rate_hz
-            while number < due:
-                number += 1
-                if self.sending:
-                    push(number / rate_hz)
+            passed_s = (time.monotonic_ns() - self._began_ns) / 1e9
+            due: list[tuple[float, int]] = []
+            for at, (rate_hz, _) in enumerate(sources):
+                until = int(passed_s * rate_hz)
+                due += [(number / rate_hz, at) for number in range(numbers[at] + 1, until + 1)]
+                numbers[at] = until
+            if self.sending:
+                for t_s, at in sorted(due):
+                    sources[at][1](t_s)
             await asyncio.sleep(0.002)
 
 
@@ -166,7 +178,8 @@ async def measure(folder: Path, port: int, seconds: float) -> dict[str, Any]:
     rig = load_rig(folder / "rig.toml")
     store = CalibrationStore(folder / "state" / "calibrations", rig.calibration_store)
     store.save(plain_calibration(rig.chain))
-    listener = Listener(broker(port, BASE), ("bridge/health", "device/+/availability"))
+    topics = ("bridge/health", "bridge/event", "device/+/availability")
+    listener = Listener(broker(port, BASE), topics)
 
     async def counted() -> tuple[dict[str, int], dict[str, Any]]:
         inputs.sending = False
@@ -180,8 +193,9 @@ async def measure(folder: Path, port: int, seconds: float) -> dict[str, Any]:
             await listener.connected(RATES_HZ)
             await asyncio.sleep(SETTLE_S)
             sent_before, before = await counted()
+            listener.events.clear()
             inputs.sending = True
-            await asyncio.sleep(seconds)
+            await _report_drops(listener, before, seconds)
             sent, after = await counted()
             child.check()
     finally:
@@ -189,10 +203,13 @@ async def measure(folder: Path, port: int, seconds: float) -> dict[str, Any]:
             task.cancel()
         await asyncio.wait(tasks)
 
+    if listener.events:
+        print(listener.format_events())
     found = {}
     for name, rate_hz in RATES_HZ.items():
         device = after[name]
-        grown = {key: device[key] - before[name][key] for key in ("received", *COUNTERS)}
+        keys = ("received", *COUNTERS, "restarts")  # a restart of a clock drops pending samples
+        grown = {key: device[key] - before[name][key] for key in keys}
         outcomes = sum(device[key] for key in OUTCOMES) + device["pending"]
         found[name] = grown | {
             "rate_hz": rate_hz,
@@ -200,6 +217,21 @@ async def measure(folder: Path, port: int, seconds: float) -> dict[str, Any]:
             "unaccounted": device["received"] - outcomes if name != "mocap" else 0,
         }
     return {"seconds": seconds, "inputs": found}
+
+
+async def _report_drops(listener: Listener, before: dict[str, Any], seconds: float) -> None:
+    """Wait for `seconds`; print when samples are dropped, because the cause may be brief."""
+    began_s = time.monotonic()
+    dropped = {name: before[name]["dropped"] for name in RATES_HZ}
+    while (passed_s := time.monotonic() - began_s) < seconds:
+        devices = listener.latest["bridge/health"]["devices"]
+        for name, count in dropped.items():
+            if (now := devices[name]["dropped"]) != count:
+                dropped[name] = now
+                print(
+                    f"{name}: {now - count} dropped, {passed_s:.1f} s after the start", flush=True
+                )
+        await asyncio.sleep(min(0.5, seconds - passed_s))
 
 
 def main() -> int:

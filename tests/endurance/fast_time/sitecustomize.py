@@ -1,21 +1,46 @@
 """Time of a daemon process runs faster than real time: Python imports this module at its start.
 
 ENDURANCE is the path of a file, the factor, and the instant at which both times agree, ns of
-CLOCK_MONOTONIC. The file receives the numbers of asyncio tasks and of Python objects.
+CLOCK_MONOTONIC. The file receives the numbers of asyncio tasks, of Python objects and of bytes that
+malloc has allocated.
 """
 
 import asyncio
+import ctypes
 import gc
 import mmap
 import os
 import selectors
 import struct
+import sys
 import time
 from pathlib import Path
 
-_COUNTS = struct.Struct("<qq")
+_COUNTS = struct.Struct("<qqq")
 _COUNT_S = 2.0
 """Real time between two counts, s: one takes milliseconds."""
+
+
+class _Mallinfo(ctypes.Structure):
+    """Result of mallinfo2 of glibc."""
+
+    _fields_ = tuple(
+        (name, ctypes.c_size_t)
+        for name in (
+            *("arena", "ordblks", "smblks", "hblks", "hblkhd"),
+            *("usmblks", "fsmblks", "uordblks", "fordblks", "keepcost"),
+        )
+    )
+
+
+_mallinfo2 = ctypes.CDLL(None).mallinfo2
+_mallinfo2.restype = _Mallinfo
+
+
+def _allocated_bytes() -> int:
+    """Return the size of all allocated blocks: unlike the resident memory, without free blocks."""
+    found = _mallinfo2()
+    return int(found.uordblks + found.hblkhd)
 
 
 def _install(path: str, factor: int, begin_ns: int) -> None:
@@ -35,6 +60,9 @@ def _install(path: str, factor: int, begin_ns: int) -> None:
     time.time = lambda: time.time_ns() * 1e-9
     time.sleep = lambda seconds: real_sleep(float(seconds) / factor)
 
+    # A thread that waits for the interpreter waits as long as in real time, in the process's time.
+    sys.setswitchinterval(sys.getswitchinterval() / factor)
+
     with Path(path).open("r+b") as file:
         shared = mmap.mmap(file.fileno(), _COUNTS.size)
     counted_ns = 0
@@ -43,7 +71,8 @@ def _install(path: str, factor: int, begin_ns: int) -> None:
         nonlocal counted_ns
         if real_ns() - counted_ns > _COUNT_S * 1e9:
             counted_ns = real_ns()
-            _COUNTS.pack_into(shared, 0, len(asyncio.all_tasks()), len(gc.get_objects()))
+            objects = len(gc.get_objects())
+            _COUNTS.pack_into(shared, 0, len(asyncio.all_tasks()), objects, _allocated_bytes())
         wait_s = timeout / factor if timeout is not None and timeout > 0 else timeout
         return real_select(self, wait_s)
 
