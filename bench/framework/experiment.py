@@ -156,6 +156,19 @@ def median_and_worst(
     ]
 
 
+def median_and_smallest(
+    name: str, values: Sequence[float], unit: str = "", *, minimum: float = -inf
+) -> list[Result]:
+    """Return median and smallest value of several subjects or draws; small values are worse.
+
+    The median must be at least `minimum`.
+    """
+    return [
+        Result(f"{name}, median", median(values), minimum=minimum, unit=unit),
+        Result(f"{name}, smallest", min(values), unit=unit),
+    ]
+
+
 def find_experiments(topic: str = "") -> list[Experiment]:
     """Return the experiments of a package of ``bench.experiments``, or all of them."""
     found: list[Experiment] = []

@@ -38,15 +38,16 @@ SIMULATED_MARKERS = Material(
     "markers simulated on the movements of 1 adult (OpenCap subject 4)",
     "simulated marker positions and joint angles",
 )
-OPENSIM_MODELS = Material(
-    "2 adults (OpenCap subject 4, OpenSim gait2354)",
+OPENSIM_OPENCAP = Material(
+    "1 adult (OpenCap subject 4)",
     "OpenSim's InverseKinematicsTool on otherwise unchanged models, with unit weights",
 )
-MODEL_CENTERS = Material(
-    "2 adults (OpenCap subject 4, OpenSim gait2354)",
-    "joint centres of scaled models in the poses of OpenSim's inverse kinematics; the "
+OPENSIM_GAIT = OPENSIM_OPENCAP._replace(subjects="1 adult (OpenSim gait2354)")
+OPENCAP_CENTERS = OPENSIM_OPENCAP._replace(
+    reference="joint centres of scaled models in the poses of OpenSim's inverse kinematics; the "
     "joints of the models move by 4 to 18 mm relative to the markers",
 )
+GAIT_CENTERS = OPENCAP_CENTERS._replace(subjects=OPENSIM_GAIT.subjects)
 SIMULATED_CLOCKS = Material(
     "simulated device clocks, transports and movements", "clocks and movements of the simulator"
 )

@@ -43,15 +43,24 @@ def speed_experiment(
     id: str,
     title: str,
     measure: Callable[[bool], list[Result]],
+    *,
+    in_short_run: bool = True,
+    recordings: tuple[str, ...] = (),
+    packages: tuple[str, ...] = (),
 ) -> Experiment:
-    """Return an experiment of ``bench.experiments.speed``; `measure` receives `quick`."""
+    """Return an experiment of ``bench.experiments.speed``; `measure` receives `quick`.
+
+    An experiment that compares settings and has no thresholds can be left out of `make bench`.
+    """
     return Experiment(
         id,
         title,
         lambda _: measure(False),
         THIS_MACHINE,
+        recordings,
+        packages,
         timed=True,
-        quick_run=lambda _: measure(True),
+        quick_run=(lambda _: measure(True)) if in_short_run else None,
     )
 
 

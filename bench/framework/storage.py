@@ -7,6 +7,7 @@ path. Values have as many digits as on the pages, so a repeated run changes time
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -49,7 +50,7 @@ def to_json(experiment: Experiment, results: Sequence[Result]) -> dict[str, Any]
         "results": [
             {
                 "name": result.name,
-                "value": _number(shown(result.value)),
+                "value": _number(_value(result)),
                 "unit": result.unit,
                 "minimum": _limit(result.minimum),
                 "maximum": _limit(result.maximum),
@@ -73,6 +74,13 @@ def in_short_run(experiment: Experiment) -> bool:
     if experiment.quick_run is not None:
         return False
     return experiment.headline or not (experiment.long or experiment.timed)
+
+
+def _value(result: Result) -> float:
+    """Return the value as shown; with all digits if rounding changes whether a threshold is met."""
+    value = shown(result.value)
+    is_same = replace(result, value=value).met == result.met
+    return value if is_same else float(result.value)
 
 
 def _number(value: float) -> float | str:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from jointfit_daemon.limb_model import Calibration
-    from jointfit_daemon.tools.child_processes import Simulator
+    from jointfit_daemon.tools.child_processes import ChildProcess, Simulator
 
 SETTLE_S = 4.0
 """Time in which the clocks converge, s. It is not part of the measurement."""
@@ -40,6 +40,7 @@ CONNECT_S, END_S = 40.0, 20.0
 FLOOD_START_S = 0.5
 """Time in which the flooding process starts and connects, s. It is not part of the measurement."""
 ROOT = Path(__file__).resolve().parents[2]
+COMPILED = ROOT / "build" / "compiled"
 OUTCOMES = ("used", "decimated", "idle", "late", "duplicate", "dropped", "pending")
 TOPICS = ("pose", "bridge/health", "bridge/state", "device/+/availability")
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
@@ -150,16 +151,18 @@ class Gateway:
     """Monotonic start time of the daemon."""
 
 
-async def run(folder: Path, port: int, load: Load, seconds: float) -> Figures:
+async def run(
+    folder: Path, port: int, load: Load, seconds: float, *, compiled: bool = False
+) -> Figures:
     """Start all processes, wait, measure for `seconds`, stop the devices, and count all samples."""
-    async with running_gateway(folder, port, load) as gateway:
+    async with running_gateway(folder, port, load, compiled=compiled) as gateway:
         heard = gateway.heard
         measured = await _measure(gateway.pid, heard, seconds)
         sent = (await gateway.hardware.quit())["sent"]
         devices = await _last_health(heard)
         return Figures(
             *measured,
-            _unaccounted(sent, devices),
+            unaccounted(sent, devices),
             sum(device["received"] for device in devices.values()),
             (heard.running_s or 0.0) - gateway.began_s,
             (heard.first_pose_s or 0.0) - gateway.began_s,
@@ -209,8 +212,13 @@ async def flooder(port: int, base: str, seconds: float) -> AsyncIterator[asyncio
 
 
 @asynccontextmanager
-async def running_gateway(folder: Path, port: int, load: Load) -> AsyncIterator[Gateway]:
-    """Start devices, subscriber and daemon; wait until all sources are online."""
+async def running_gateway(
+    folder: Path, port: int, load: Load, *, compiled: bool = False
+) -> AsyncIterator[Gateway]:
+    """Start devices, subscriber and daemon; wait until all sources are online.
+
+    With `compiled`, the daemon uses the modules in build/compiled.
+    """
     base = f"jointfit/{folder.name}"
     CalibrationStore(folder / "state" / "calibrations", "demo").save(calibration())
     async with simulator(folder, port, base, load.options) as hardware:
@@ -220,7 +228,7 @@ async def running_gateway(folder: Path, port: int, load: Load) -> AsyncIterator[
         wanted = {source.id for source in rig.sources}
         async with subscriber(rig.mqtt) as heard:
             began = time.monotonic()
-            async with daemon(folder, rig_file) as process:
+            async with daemon_variant(folder, rig_file, compiled=compiled) as process:
                 assert process.process is not None
                 async with asyncio.timeout(CONNECT_S):
                     while not heard.online >= wanted:
@@ -228,6 +236,16 @@ async def running_gateway(folder: Path, port: int, load: Load) -> AsyncIterator[
                         await asyncio.sleep(0.05)
                 await asyncio.sleep(SETTLE_S)
                 yield Gateway(hardware, process.process.pid, base, heard, began)
+
+
+def daemon_variant(folder: Path, rig_file: Path, *, compiled: bool) -> ChildProcess:
+    """Return the daemon process on the sources, or on the modules in build/compiled."""
+    process = daemon(folder, rig_file)
+    if compiled:
+        paths = (str(COMPILED), str(ROOT))
+        # PYTHONSAFEPATH prevents Python from importing the checkout in the current folder.
+        process.environment |= {"PYTHONPATH": os.pathsep.join(paths), "PYTHONSAFEPATH": "1"}
+    return process
 
 
 @asynccontextmanager
@@ -270,7 +288,8 @@ async def _last_health(heard: ReceivedMessages) -> dict[str, Any]:
     return devices
 
 
-def _unaccounted(sent: dict[str, int], devices: dict[str, dict[str, Any]]) -> int:
+def unaccounted(sent: dict[str, int], devices: dict[str, dict[str, Any]]) -> int:
+    """Return the number of samples that were not received, or have no outcome."""
     lost = 0
     for name, device in devices.items():
         received = device["received"]

@@ -28,6 +28,7 @@ def test_functions_of_libraries_are_not_counted() -> None:
     assert count_instructions(lambda: encoder.encode([1, 2, 3])) < plain + 20
 
 
+@pytest.mark.experiment
 @pytest.mark.skipif(sys.version_info[:2] != PYTHON, reason="counts are those of Python 3.11")
 def test_no_part_of_the_path_of_a_frame_needs_more_instructions() -> None:
     (experiment,) = instruction_counts.EXPERIMENTS

@@ -20,7 +20,7 @@ def test_without_forgetting_recursive_is_ridge_regression() -> None:
         assert stepwise.feed(row, target)
         sums.feed(row, target)
     augmented = np.vstack([g, np.sqrt(0.5) * np.eye(6)])
-    batch = np.linalg.lstsq(augmented, np.vstack([y, np.zeros((6, 2))]))[0]
+    batch = np.linalg.lstsq(augmented, np.vstack([y, np.zeros((6, 2))]), rcond=None)[0]
     assert np.allclose(stepwise.coefficients, batch, atol=1e-11)
     assert np.allclose(sums.coefficients, batch, atol=1e-11)
 
@@ -37,6 +37,7 @@ def test_forgetting_follows_a_change_and_remembering_does_not() -> None:
     assert np.linalg.norm(slow.coefficients[:, 0] - [3.0, -1.0]) > 0.5
 
 
+@pytest.mark.experiment
 def test_standing_still_for_an_hour_does_not_wind_the_estimate_up() -> None:
     rng = np.random.default_rng(2)
     tracker = RecursiveLeastSquares(2, 1, 1e-3, 0.999)

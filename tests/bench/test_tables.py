@@ -12,6 +12,13 @@ from bench.framework.material import SEEDED
 
 EXPERIMENTS = {experiment.id: experiment for experiment in find_experiments()}
 SHORT = [e for e in EXPERIMENTS.values() if not e.long and e.topic not in {"speed", "joint_center"}]
+SEVERAL = re.compile(r"[0-9]+ simulated (subjects|sensors)|(five|eight) assignments")
+"""Material of several subjects, or of several assignments of filter errors to sensors."""
+COUNTED = {
+    "healthy-sensors-simulated", "healthy-sensors-after-squats", "healthy-sensors-after-walking",
+    "online-learning-wrong-cameras",
+}  # fmt: skip
+"""Experiments that count events over all subjects."""
 WORDS = re.compile(r"[a-z]+[0-9]*(-[a-z]+)+")  # names of devices end with digits
 
 
@@ -47,6 +54,26 @@ def test_committed_results_describe_their_experiment(experiment: Experiment) -> 
     assert results
     assert storage.to_json(experiment, results) == content
     assert {r.name for r in results if not r.met} == set(experiment.known_misses)
+
+
+@pytest.mark.parametrize(
+    "experiment",
+    [e for e in EXPERIMENTS.values() if SEVERAL.search(e.material.subjects) if e.id not in COUNTED],
+    ids=lambda e: e.id,
+)
+def test_table_of_several_subjects_or_deals_has_median_and_extreme(experiment: Experiment) -> None:
+    results = storage.results_of(storage.load(experiment.id))
+    text = " ".join([experiment.title, *(f"{r.name} {r.note}" for r in results)])
+    assert "median" in text
+    assert re.search("worst|smallest|largest", text)
+
+
+def test_rounding_of_a_stored_value_does_not_change_whether_it_meets_its_threshold() -> None:
+    experiment = EXPERIMENTS["all-methods-simulated-subjects"]
+    missed, met = Result("x", 0.62961, minimum=0.63), Result("y", 0.63012, minimum=0.63)
+    stored = storage.to_json(experiment, [missed, met])
+    assert [each["value"] for each in stored["results"]] == [0.62961, 0.63]
+    assert [each.met for each in storage.results_of(stored)] == [False, True]
 
 
 def test_result_outside_its_thresholds_is_not_met() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from bench.experiments.timing.memory import Held, growth, held, watch
 
 KIB = 1024
@@ -9,6 +11,7 @@ FULL_H = 0.06
 """Minute-long windows are full, two minutes of echoes too."""
 
 
+@pytest.mark.experiment
 def test_core_memory_does_not_grow_in_a_quarter_of_an_hour() -> None:
     looks, samples, states = watch(0.25, 30)
     sizes = [look.size for look in looks if look.hours > FULL_H]

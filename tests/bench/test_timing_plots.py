@@ -26,6 +26,7 @@ def watched() -> tuple[SimulatedRun, Trace]:
     return run, traced(run.events)
 
 
+@pytest.mark.experiment
 def test_every_stream_is_traced_with_its_skew_and_the_error_of_its_stamps() -> None:
     run, trace = watched()
     assert set(trace.looks) == set(trace.stamps) == STREAMS
@@ -39,6 +40,7 @@ def test_every_stream_is_traced_with_its_skew_and_the_error_of_its_stamps() -> N
         assert abs(looks[-1].skew_ppm) < 80
 
 
+@pytest.mark.experiment
 def test_trace_contains_the_lag_that_clocks_cannot_estimate() -> None:
     run, trace = watched()
     for name, windows in trace.lags.items():
@@ -49,6 +51,7 @@ def test_trace_contains_the_lag_that_clocks_cannot_estimate() -> None:
             assert abs(estimate.lag_ns - truth_ns) < 4 * estimate.sigma_ns + 50_000
 
 
+@pytest.mark.experiment
 def test_trace_contains_both_incidents() -> None:
     run, trace = watched()
     gone_s = run.incidents["S3 reboots"]

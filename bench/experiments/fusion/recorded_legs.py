@@ -3,9 +3,8 @@
 A column is the median error of one segment or of flexion over eight assignments (deals) of filter
 errors. Each column has one leg, movement, training set and reference. The default method must be
 the best in every column, or within `MARGIN_DEG` of the best. Two experiments compare all methods in
-one movement each. Another experiment evaluates the
-errors about the long axes of the segments while the knee is nearly straight, where the reference is
-least certain.
+one movement each. Another experiment evaluates the errors about the long axes of the segments while
+the knee is nearly straight, where the reference is least certain.
 """
 
 from __future__ import annotations
@@ -138,12 +137,16 @@ def straight_knee(data: Path, deals: Sequence[int] = DEALS) -> list[Result]:
         for leg in LEGS:
             found = [_long_axis(data, LegCase(leg, deal, reference)) for deal in deals]
             for movement in SHORT_MOVEMENTS:
-                values = np.median([each[movement] for each in found], axis=0).tolist()
+                of_deals = np.array([each[movement] for each in found])
+                statistics = {
+                    "median": np.median(of_deals, axis=0),
+                    "smallest": of_deals.min(axis=0),
+                    "largest": of_deals.max(axis=0),
+                }
                 results += [
-                    Result(
-                        f"{reference}, {leg}, {movement}: {name}", value, float("inf"), unit=unit
-                    )
-                    for (name, unit), value in zip(LONG_AXIS_RESULTS, values, strict=True)
+                    Result(f"{reference}, {leg}, {movement}, {label}: {name}", value, unit=unit)
+                    for label, values in statistics.items()
+                    for (name, unit), value in zip(LONG_AXIS_RESULTS, values.tolist(), strict=True)
                 ]
     return results
 
@@ -266,7 +269,8 @@ LATER_PARTS = {
 EXPERIMENTS = (
     _experiment(
         "recorded-legs-later-parts",
-        "Errors in the later parts of four movements, after training on their first 60 %",
+        "Errors in the later parts of four movements, after training on their first 60 %; median "
+        "of eight deals",
         guided,
         LATER_PARTS,
     ),
@@ -280,7 +284,8 @@ EXPERIMENTS = (
     ),
     _experiment(
         "recorded-legs-after-squats",
-        "Errors in four movements, after training on the first 60 % of the squats alone",
+        "Errors in four movements, after training on the first 60 % of the squats alone; median of "
+        "eight deals",
         squats_alone,
         AFTER_SQUATS,
     ),

@@ -17,7 +17,12 @@ import numpy as np
 from bench.baselines import fusion_methods
 from bench.experiments.fusion.recorded_movements import DEFAULT, NAMES, NOTHING, flexion_scores
 from bench.experiments.fusion.simulated_leg import take_pose, wear_live
-from bench.framework.experiment import Experiment, Result
+from bench.framework.experiment import (
+    Experiment,
+    Result,
+    median_and_smallest,
+    median_and_worst,
+)
 from bench.framework.material import simulated_subjects
 from bench.subjects.recorded_knee import Judge, KneeTrial
 from bench.subjects.simulated_wearer import bench_rig, phases
@@ -28,6 +33,7 @@ from jointfit_daemon.fusion import HEADING_SD
 from jointfit_daemon.kinematics import rotation
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from jointfit_daemon.arrays import Array
@@ -77,27 +83,24 @@ def simulated(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
     people = [found for seed in seeds if (found := person(seed)) is not None]
     figures = [Result("subjects accepted", len(people), len(seeds), len(seeds) - 2, unit="")]
     errors = {
-        method: np.sqrt(
-            np.mean(
-                [
-                    np.square(
-                        Judge.of(taught).errors(fusion_methods.fit(method, [taught])(later), later)
-                    )
-                    for taught, later in people
-                ],
-                axis=0,
-            )
+        method: np.array(
+            [
+                Judge.of(taught).errors(fusion_methods.fit(method, [taught])(later), later)
+                for taught, later in people
+            ]
         )
         for method in fusion_methods.METHODS
     }
-    for method, found in errors.items():
-        goals = [NOTHING] * 3
-        if method == DEFAULT:
-            goals = [min(errors[m][i] for m in fusion_methods.METHODS[:5]) for i in range(3)]
-        figures += [
-            Result(f"{method}: {name}", float(error), round(float(goal), 3))
-            for name, error, goal in zip(NAMES, found, goals, strict=True)
-        ]
+    rivals = [errors[method] for method in fusion_methods.METHODS[:5]]
+    medians, worst = np.median(rivals, axis=1).min(axis=0), np.max(rivals, axis=1).min(axis=0)
+    for method, of_method in errors.items():
+        for i, name in enumerate(NAMES):
+            figures += median_and_worst(
+                f"{method}: {name}",
+                of_method[:, i].tolist(),
+                maximum=round(float(medians[i]), 3) if method == DEFAULT else NOTHING,
+                worst_maximum=round(float(worst[i]), 3) if method == DEFAULT else NOTHING,
+            )
     return figures + _coverage(people)
 
 
@@ -105,9 +108,9 @@ def _coverage(people: list[tuple[KneeTrial, KneeTrial]]) -> list[Result]:
     figures = []
     for method in ("mean", "patent12", "linear", DEFAULT):
         scores = [flexion_scores([taught], later, method) for taught, later in people]
-        figures += _shares(f"{method}: flexion", np.concatenate(scores), held=method == DEFAULT)
+        figures += _shares(f"{method}: flexion", scores, held=method == DEFAULT)
     segments = [_segment_scores(taught, later) for taught, later in people]
-    return figures + _shares(f"{DEFAULT}: segments, any axis", np.concatenate(segments), held=True)
+    return figures + _shares(f"{DEFAULT}: segments, any axis", segments, held=True)
 
 
 def _segment_scores(taught: KneeTrial, later: KneeTrial) -> Array:
@@ -125,20 +128,26 @@ def _segment_scores(taught: KneeTrial, later: KneeTrial) -> Array:
     return np.concatenate(scores)
 
 
-def _shares(label: str, scores: Array, *, held: bool) -> list[Result]:
+def _shares(label: str, scores: Sequence[Array], *, held: bool) -> list[Result]:
+    """Return the coverage of all subjects together, of the median and of the worst subject."""
     tolerance = TOLERANCE if held else NOTHING
-    return [
-        Result(
-            f"{label} within {within:g} sd",
-            float(np.mean(np.abs(scores) < within)),
-            round(share + tolerance, 9),
-            minimum=round(share - tolerance, 9) if held else -NOTHING,
-            unit="",
-        )
-        for share, within in ((0.68, 1.0), (0.95, 1.96))
-    ]
+    results = []
+    for share, within in ((0.68, 1.0), (0.95, 1.96)):
+        name = f"{label} within {within:g} sd"
+        least, most = round(share - tolerance, 9), round(share + tolerance, 9)
+        together = float(np.mean(np.abs(np.concatenate(scores)) < within))
+        each = [float(np.mean(np.abs(subject) < within)) for subject in scores]
+        results += [
+            Result(name, together, most, least, ""),
+            *median_and_smallest(name, each, minimum=least),
+        ]
+    return results
 
 
+MEDIAN_SUBJECT = (
+    "the frames of all subjects together meet the threshold; the median subject is below it by "
+    "less than 0.001"
+)
 EXPERIMENTS = (
     Experiment(
         "all-methods-simulated-subjects",
@@ -146,5 +155,6 @@ EXPERIMENTS = (
         simulated,
         simulated_subjects(len(SEEDS)),
         long=True,
+        known_misses={f"{DEFAULT}: segments, any axis within 1 sd, median": MEDIAN_SUBJECT},
     ),
 )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.framework.experiment import Experiment, Result
-from bench.framework.material import SEEDED
+from bench.framework.material import SEEDED, Material
 from bench.subjects.noisy_bodies import Subject
 from bench.subjects.simulated_joints import covers
 from jointfit_daemon.center_of_rotation import estimate_center
@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 SUBJECTS = 8
 RUNS = 125
 """Number of runs per subject. The coverage of 1000 runs has a standard error of 0.7 %."""
+METHOD_RUNS = 50
+"""Number of runs per subject for the comparison of methods."""
+ARTEFACT_RUNS = 25
+"""Number of runs per subject with soft-tissue artefact."""
 ANGLES_DEG = (20.0, 45.0, 90.0)
 WORST_PERCENT = 87.0
 """Threshold for the subject with the smallest coverage: 4 standard errors below 95 % for 125 runs.
@@ -137,15 +141,21 @@ def _noise(_: Path) -> list[Result]:
 
 
 def _methods(_: Path) -> list[Result]:
-    return compare_methods(50)
+    return compare_methods(METHOD_RUNS)
 
 
 def _soft_tissue(_: Path) -> list[Result]:
-    return measure_soft_tissue(25)
+    return measure_soft_tissue(ARTEFACT_RUNS)
 
 
 def _gate(_: Path) -> list[Result]:
     return measure_gate(4000)
+
+
+def _drawn(runs: int) -> Material:
+    """Return the material of the simulated subjects with a number of runs each."""
+    subjects = f"{SUBJECTS} simulated subjects with different markers, {runs} runs each"
+    return SEEDED._replace(subjects=subjects)
 
 
 EXPERIMENTS = (
@@ -153,21 +163,21 @@ EXPERIMENTS = (
         "noisy-bodies-coverage",
         "Coverage of 95 % ellipsoids: two noisy bodies, clusters 8 cm wide, 20 cm from the joint",
         _noise,
-        SEEDED,
+        _drawn(RUNS),
         long=True,
     ),
     Experiment(
         "noisy-bodies-methods",
         "Two noisy bodies, noise 1 mm, four markers each: the default (score) and other methods",
         _methods,
-        SEEDED,
+        _drawn(METHOD_RUNS),
         long=True,
     ),
     Experiment(
         "noisy-bodies-soft-tissue",
         "Two noisy bodies with soft-tissue artefact, noise 0.3 mm",
         _soft_tissue,
-        SEEDED,
+        _drawn(ARTEFACT_RUNS),
         long=True,
     ),
     Experiment(

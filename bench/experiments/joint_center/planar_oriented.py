@@ -116,14 +116,15 @@ def short_arc(_: Path) -> list[Result]:
 EXPERIMENTS = (
     Experiment(
         "oriented-circle-angle-noise",
-        "Circle fit with measured angles whose noise is as stated, or up to three times larger",
+        "Circle fit with measured angles whose noise is as stated, or up to three times larger; "
+        "200 runs each",
         table,
         SEEDED,
         long=True,
     ),
     Experiment(
         "oriented-circle-short-arc",
-        "Circle fit with measured angles on a short arc",
+        "Circle fit with measured angles on a short arc, 200 runs each",
         short_arc,
         SEEDED,
     ),

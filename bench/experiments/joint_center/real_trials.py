@@ -15,7 +15,7 @@ import numpy as np
 
 from bench.baselines.center_estimators import judged
 from bench.framework.experiment import Experiment, Result
-from bench.framework.material import MODEL_CENTERS
+from bench.framework.material import GAIT_CENTERS, OPENCAP_CENTERS
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -72,7 +72,7 @@ def _comparison(trial: str, movement: str) -> Experiment:
         IDS[movement],
         f"Functional joint centres compared with the centres of the model: {movement}",
         partial(compare, trial),
-        MODEL_CENTERS,
+        GAIT_CENTERS if trial == "gait2354" else OPENCAP_CENTERS,
         recordings=(folder,),
         packages=("opensim",),
         long=True,

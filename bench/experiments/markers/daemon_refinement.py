@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.experiments.fusion.simulated_leg import SEEDS, SEGMENTS, errors_of, take_pose, wear_live
-from bench.framework.experiment import Experiment, Result
+from bench.framework.experiment import Experiment, Result, median_and_worst
 from bench.framework.material import simulated_subjects
 from bench.subjects.simulated_wearer import bench_rig, phases
 from jointfit_daemon.calibration.anatomy import track_cluster
@@ -61,17 +61,17 @@ def refined(_: Path) -> list[Result]:
             functional = _knocked(trials.functional, pose, seed)
             knocked.append(_change(rig, pose, functional, alignment, live)[0])
         phases.cache_clear()
-    before, after = np.mean(off_mm, axis=(0, 1))
+    before, after = np.mean(off_mm, axis=1).T
+    rigid = "distance from a rigid segment"
     return [
         Result("subjects", float(len(worn)), NOTHING, unit=""),
-        Result(
-            "distance from a rigid segment, static positions", float(before), NOTHING, unit="mm"
-        ),
-        Result(
-            "distance from a rigid segment, refined positions",
-            float(after),
-            round(float(before), 2),
-            unit="mm",
+        *median_and_worst(f"{rigid}, static positions", before.tolist(), "mm"),
+        *median_and_worst(
+            f"{rigid}, refined positions",
+            after.tolist(),
+            "mm",
+            maximum=round(float(np.median(before)), 2),
+            worst_maximum=round(float(np.max(before)), 2),
         ),
         *_changes("markers as placed", worn, COSTS_NOTHING_DEG),
         *_changes(f"one marker per segment displaced, {len(knocked)} subjects", knocked, 0.0),
@@ -97,9 +97,9 @@ def _changes(label: str, found: list[Array], goal: float) -> list[Result]:
     table = np.array(found)
     figures = []
     for i, name in enumerate(("knee", *SEGMENTS)):
-        mean, worst = float(table[:, i].mean()), float(table[:, i].max())
-        figures.append(Result(f"{label}: {name}, mean change", mean, goal, -NOTHING))
-        figures.append(Result(f"{label}: {name}, worst change", worst, NOTHING, -NOTHING))
+        title, changes = f"{label}: {name}", table[:, i].tolist()
+        figures.append(Result(f"{title}, mean", float(np.mean(changes)), goal))
+        figures += median_and_worst(title, changes, maximum=goal, worst_maximum=NOTHING)
     return figures
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.framework.experiment import Experiment, Result, near
-from bench.framework.material import OPENSIM_MODELS
+from bench.framework.material import OPENSIM_GAIT, OPENSIM_OPENCAP
 from bench.subjects.opensim_reference import CONVERGED, OpenSimFollower, judge
 from bench.subjects.opensim_trials import GAIT, OPENCAP, gait2354, opencap
 from jointfit_daemon.calibration.marker_refinement import RefinementSettings, refine_markers, search
@@ -223,7 +223,7 @@ EXPERIMENTS = (
         "opensim-gait-scaled",
         "gait2354 as scaled, with refined markers: error in OpenSim's inverse kinematics",
         scaled_only,
-        OPENSIM_MODELS,
+        OPENSIM_GAIT,
         (GAIT,),
         _OPENSIM,
         long=True,
@@ -233,7 +233,7 @@ EXPERIMENTS = (
         "opensim-coordinate-search",
         "gait2354: comparison with the published coordinate search through OpenSim",
         beside_opensim,
-        OPENSIM_MODELS,
+        OPENSIM_GAIT,
         (GAIT,),
         _OPENSIM,
         long=True,
@@ -242,7 +242,7 @@ EXPERIMENTS = (
         "opensim-walking-only",
         "Markers refined on walking alone: error in OpenSim's inverse kinematics",
         walking_alone,
-        OPENSIM_MODELS,
+        OPENSIM_OPENCAP,
         (OPENCAP,),
         _OPENSIM,
         long=True,
@@ -252,7 +252,7 @@ EXPERIMENTS = (
         "opensim-three-movements",
         "Markers refined on three movements: error in OpenSim's inverse kinematics",
         three_movements,
-        OPENSIM_MODELS,
+        OPENSIM_OPENCAP,
         (OPENCAP,),
         _OPENSIM,
         long=True,

@@ -13,7 +13,7 @@ import numpy as np
 
 from bench.experiments.markers.opensim import EVERYTHING
 from bench.framework.experiment import Experiment, Result
-from bench.framework.material import OPENSIM_MODELS
+from bench.framework.material import OPENSIM_OPENCAP
 from bench.subjects.opensim_trials import OPENCAP, opencap, opencap_legs
 from jointfit_daemon.calibration.marker_refinement import RefinementSettings, refine_markers
 from jointfit_daemon.files.axes import to_z_up
@@ -117,8 +117,8 @@ WALKING = (
     "and static pose)"
 )
 EVEN = (
-    "walking and the jump have the most soft-tissue artefact and improve least if they are"
-    " not trained; no frame was in a local minimum of inverse kinematics"
+    "walking and the jump improve less than squats and sit-to-stand if they are not trained; no "
+    "frame was in a local minimum of inverse kinematics"
 )
 EXPERIMENTS = (
     Experiment(
@@ -126,7 +126,7 @@ EXPERIMENTS = (
         "Markers of pelvis and legs, refined on all movements but one: error of this "
         "movement in OpenSim's inverse kinematics",
         every_movement,
-        OPENSIM_MODELS,
+        OPENSIM_OPENCAP,
         (OPENCAP,),
         ("opensim",),
         long=True,

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.framework.experiment import Experiment, Result
+from bench.framework.experiment import Experiment, Result, median_and_smallest
 from bench.framework.material import LOWER_LIMBS, SIMULATED_MARKERS
 from bench.subjects.adult_lower_limbs import FOLDER, measured, oc4_lower
 from jointfit_daemon.calibration.marker_refinement import (
@@ -204,16 +204,20 @@ def people(data: Path, count: int = 8) -> list[Result]:
         fits += [
             (t.before.rms, t.after.rms, t.before.variance, t.after.variance) for t in found.trials
         ]
-    e0, e1, v0, v1 = np.array(fits).T
-    return [
-        Result("reduction of the tracking error", 100 * (1 - e1.mean() / e0.mean()), inf, 50, "%"),
-        Result(
-            "reduction of the variance over frames", 100 * (1 - v1.mean() / v0.mean()), inf, 20, "%"
-        ),
-        Result(
-            "reduction of the variance over trials", 100 * (1 - e1.var() / e0.var()), inf, 20, "%"
-        ),
-    ]
+    e0, e1, v0, v1 = np.array(fits).reshape(count, -1, 4).transpose(2, 0, 1)
+    reductions = (
+        ("tracking error", 50, np.mean, e0, e1),
+        ("variance over frames", 20, np.mean, v0, v1),
+        ("variance over trials", 20, np.var, e0, e1),
+    )
+    results = []
+    for name, least, statistic, before, after in reductions:
+        title = f"reduction of the {name}"
+        total = float(100 * (1 - statistic(after) / statistic(before)))
+        each = (100 * (1 - statistic(after, axis=1) / statistic(before, axis=1))).tolist()
+        results.append(Result(title, total, inf, least, "%"))
+        results += median_and_smallest(title, each, "%", minimum=least)
+    return results
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,6 +274,7 @@ def truth(data: Path, count: int = 8) -> list[Result]:
         Result("joint angle error, before", was, inf),
         Result("joint angle error, after", is_now, inf),
         Result("reduction of the joint angle error", float(np.mean(shares)), inf, 30, "%"),
+        *median_and_smallest("reduction of the joint angle error", shares, "%", minimum=30),
     ]
 
 
@@ -288,6 +293,9 @@ def feet_let_go(data: Path, count: int = 32) -> list[Result]:
     mean = np.mean(shares, axis=0)
     return [
         Result("reduction of the joint angle error", float(mean[0]), inf, 30, "%"),
+        *median_and_smallest(
+            "reduction of the joint angle error", [draw[0] for draw in shares], "%", minimum=30
+        ),
         Result("standard deviation over draws", float(np.std(shares, axis=0)[0]), inf, unit="%"),
         Result("reduction without noise and prior", float(mean[1]), inf, unit="%"),
         Result("cost of noise and prior", float(mean[1] - mean[0]), inf, unit="%"),
@@ -314,6 +322,10 @@ FREE_FEET = (
     "and toe, the reduction exceeds the threshold; movements without noise give the same "
     "value"
 )
+THREE_TRIALS = (
+    "the variance of one subject is that of three nearly equal errors, so its relative change is "
+    "mostly chance; the error of every subject is reduced by more than half"
+)
 EXPERIMENTS = (
     Experiment(
         "marker-refinement-walking",
@@ -339,7 +351,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "marker-refinement-coordinate-search",
-        "Simultaneous refinement compared with coordinate search, misplaced markers",
+        "Simultaneous refinement compared with coordinate search, one draw of misplaced markers",
         beside_search,
         LOWER_LIMBS,
         _RECORDED,
@@ -359,6 +371,7 @@ EXPERIMENTS = (
         SIMULATED_MARKERS,
         _RECORDED,
         long=True,
+        known_misses={"reduction of the variance over trials, median": THREE_TRIALS},
     ),
     Experiment(
         "marker-refinement-observability",
@@ -370,7 +383,7 @@ EXPERIMENTS = (
     Experiment(
         "marker-refinement-locked-landmarks",
         "Errors of refined markers compared with the simulated positions, anatomical "
-        "markers locked",
+        "markers locked, eight draws",
         truth,
         SIMULATED_MARKERS,
         _RECORDED,
@@ -378,11 +391,15 @@ EXPERIMENTS = (
     ),
     Experiment(
         "marker-refinement-free-feet",
-        "Errors of refined markers compared with the simulated positions, feet not locked",
+        "Errors of refined markers compared with the simulated positions, feet not locked, "
+        "32 draws",
         feet_let_go,
         SIMULATED_MARKERS,
         _RECORDED,
         long=True,
-        known_misses={"reduction of the joint angle error": FREE_FEET},
+        known_misses={
+            "reduction of the joint angle error": FREE_FEET,
+            "reduction of the joint angle error, median": FREE_FEET,
+        },
     ),
 )

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.framework.experiment import Experiment, Result
+from bench.framework.experiment import Experiment, Result, median_and_worst
 from bench.framework.material import BOARD
 from bench.subjects import raw_imu_trials
 from jointfit_daemon.kinematics import rotation
@@ -84,19 +84,21 @@ def begun_in_motion(data: Path) -> list[Result]:
             # Orientations are withheld at the beginning only.
             optical = trial.optical[part][-len(said) :]
             errors.append(rotation.angle_between(said, optical)[: 3 * SECOND])
-    figures = [
-        Result(f"published at once: second {k + 1}", _rms_deg(at_once, k), float("inf"))
-        for k in range(3)
-    ]
-    return [
-        *figures,
-        Result("settled: second 1", _rms_deg(settled, 0), SETTLED_GOAL_DEG),
-    ]
+    figures = []
+    for k in range(3):
+        figures += _rms_deg(f"published at once: second {k + 1}", at_once, k)
+    return figures + _rms_deg("settled: second 1", settled, 0, SETTLED_GOAL_DEG)
 
 
-def _rms_deg(errors: list[Array], second: int) -> float:
-    part = np.concatenate([e[second * SECOND : (second + 1) * SECOND] for e in errors])
-    return float(np.rad2deg(np.sqrt(np.nanmean(part**2))))
+def _rms_deg(
+    name: str, errors: list[Array], second: int, maximum: float = float("inf")
+) -> list[Result]:
+    """Return the RMS error of all starts together, and median and worst of the starts."""
+    parts = [e[second * SECOND : (second + 1) * SECOND] for e in errors]
+    together, *each = (
+        float(np.rad2deg(np.sqrt(np.nanmean(part**2)))) for part in (np.concatenate(parts), *parts)
+    )
+    return [Result(name, together, maximum), *median_and_worst(name, each)]
 
 
 EXPERIMENTS = (

@@ -23,13 +23,20 @@ SECONDS, QUICK_S = 20.0, 4.0
 
 
 @contextmanager
-def _mosquitto(folder: Path) -> Iterator[int]:
+def running_mosquitto(folder: Path) -> Iterator[MosquittoBroker]:
+    """Run mosquitto on a free port."""
     broker = MosquittoBroker(folder)
     broker.start()
     try:
-        yield broker.port
+        yield broker
     finally:
         broker.stop()
+
+
+@contextmanager
+def _mosquitto(folder: Path) -> Iterator[int]:
+    with running_mosquitto(folder) as broker:
+        yield broker.port
 
 
 Found = TypeVar("Found")

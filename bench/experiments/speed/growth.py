@@ -39,9 +39,9 @@ SETTLE = 300
 ROUNDS, QUICK_ROUNDS = 15, 3
 BLOCK = 100
 """Number of frames whose mean CPU time is one measurement."""
-FRAMES, QUICK_FRAMES = 100_000, 3_000
+FRAMES, QUICK_FRAMES = 1_000_000, 3_000
 """Number of frames of a full run and of a short run. The cost of a frame must not grow during a
-run. A full run is 17 minutes at 100 Hz."""
+run. A full run is 2.8 hours at 100 Hz."""
 DRIFT, SHORT_DRIFT, DRIFT_TARGET = 0.1, 0.5, 0.02
 """Limits for the absolute value of the exponent in run time: threshold of a full run, threshold of
 a short run, and target."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from bench.framework.experiment import Experiment, Result
+from bench.framework.experiment import Experiment, Result, median_and_worst
 from bench.framework.material import BOARD, SEEDED
 from bench.subjects.gyro_rates import rates_from_gyro
 from jointfit_daemon.kinematics import rotation
@@ -27,7 +27,7 @@ from jointfit_daemon.timing.lag import (
 from jointfit_daemon.units import NS_PER_MS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 HALF_FRAME_MS = 1e3 / 240
 FAST, SLOW = "07_undisturbed_fast_rotation_B", "02_undisturbed_slow_rotation_B"
 MARGIN_S = 0.3
+MOST_SIGMAS = 4.0
+"""Largest allowed ratio of the error of an accepted window to its standard deviation."""
 FAST_SD_MS = {2.0: 0.054, 5.0: 0.025, 10.0: 0.02, 30.0: 0.02}
 SLOW_SD_MS = {2.0: 0.307, 5.0: 0.21, 10.0: 0.14, 30.0: 0.14}
 """Target standard deviations of the lag, ms, by length of the window, s."""
@@ -145,7 +147,6 @@ def excerpts(
     figures = [
         Result("whole minute", estimate.lag_ns / NS_PER_MS, middle + off, middle - off, "ms")
     ]
-    free = float("inf")
     for length_s in (2.0, 5.0, 10.0, 30.0):
         tries = [windows(recording, length_s, seed=seed) for seed in (6, 7, 8, 9)]
         used = [one for found in tries for one in found if one.used]
@@ -154,11 +155,15 @@ def excerpts(
         goal = sd_goals_ms[length_s]
         label = f"{length_s:g} s windows"
         figures += [
-            Result(f"{label}, standard deviation", float(lags.std()), goal, unit="ms"),
-            Result(f"{label}, worst", float(np.abs(lags - HALF_FRAME_MS).max()), free, unit="ms"),
             Result(
-                f"{label}, median standard deviation", float(np.median(sigmas)), free, unit="ms"
+                f"{label}, standard deviation",
+                float(lags.std()),
+                goal,
+                unit="ms",
+                note=f"{len(used)} windows",
             ),
+            *median_and_worst(f"{label}, error", np.abs(lags - HALF_FRAME_MS).tolist(), "ms"),
+            *median_and_worst(f"{label}, stated standard deviation", sigmas.tolist(), "ms"),
         ]
     return figures
 
@@ -182,10 +187,14 @@ def honest(data: Path) -> list[Result]:
                     if one.used
                 ]
                 what = f"{name[15:19]}, {label}: {length_s:g} s"
-                note = f"{len(off)} windows"
-                worst = max(off, default=0.0)
-                figures.append(Result(what, worst, 4.0, unit="sd", note=note))
+                figures.append(worst_ratio(what, off))
     return figures
+
+
+def worst_ratio(name: str, ratios: Sequence[float]) -> Result:
+    """Return the largest ratio of an error to its standard deviation, with the median ratio."""
+    note = f"{len(ratios)} windows, median {np.median(ratios):.2f} sd" if ratios else "no windows"
+    return Result(name, max(ratios, default=0.0), MOST_SIGMAS, unit="sd", note=note)
 
 
 def quaternion_input(data: Path) -> list[Result]:
@@ -269,7 +278,9 @@ def sigma(_: Path) -> list[Result]:
         label = f"noise of {noise:g}°, {len(ratios)} windows"
         spread = float(np.std(ratios))
         figures.append(Result(f"{label}: standard deviation", spread, 1.5, 0.5, "sd"))
-        figures.append(Result(f"{label}: worst", float(np.abs(ratios).max()), 4.0, unit="sd"))
+        figures += median_and_worst(
+            f"{label}: error", np.abs(ratios).tolist(), "sd", maximum=MOST_SIGMAS
+        )
     return figures
 
 
@@ -337,12 +348,19 @@ def ordinary(data: Path) -> list[Result]:
     for name, label, goal in ((FAST, "vigorous", 0.02), (SLOW, "ordinary", 0.14)):
         recording = excerpt(data, name)
         tries = [windows(recording, 10.0, seed=seed) for seed in (6, 7, 8, 9)]
-        lags = [one.lag_ms for found in tries for one in found if one.used]
-        figures.append(
+        lags = np.array([one.lag_ms for found in tries for one in found if one.used])
+        figures += [
             Result(
-                f"{label}, standard deviation of 10 s windows", float(np.std(lags)), goal, unit="ms"
-            )
-        )
+                f"{label}, standard deviation of 10 s windows",
+                float(lags.std()),
+                goal,
+                unit="ms",
+                note=f"{len(lags)} windows",
+            ),
+            *median_and_worst(
+                f"{label}, error of 10 s windows", np.abs(lags - HALF_FRAME_MS).tolist(), "ms"
+            ),
+        ]
     recording = whole(data, SLOW)
     rest = recording.t_ns < 30e9
     still = Recording(recording.t_ns[rest], recording.gyro[rest], recording.optical[rest])

@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.experiments.timing.lag import FAST, HALF_FRAME_MS, Recording, whole, windows
+from bench.experiments.timing.lag import (
+    FAST,
+    HALF_FRAME_MS,
+    Recording,
+    whole,
+    windows,
+    worst_ratio,
+)
 from bench.framework.experiment import Experiment, Result
 from bench.framework.material import BOARD
 from bench.subjects.gyro_rates import rates_from_gyro
@@ -24,7 +31,6 @@ if TYPE_CHECKING:
 LENGTHS_S = (1.0, 2.0, 5.0, 10.0)
 HOP_S = {1.0: 0.5}
 """Time between the starts of windows, s, by window length, if it is not 2.5 s."""
-MOST_SIGMAS = 4.0
 TICK_MS, TICK_TOLERANCE_MS = 0.5, 0.05
 """Tick of the sensor's clock (1/2000 s), and tolerance of its measured value, ms."""
 SAWTOOTH_HZ = np.arange(0.3, 1.0, 0.002)
@@ -39,9 +45,7 @@ def all_trials(data: Path) -> list[Result]:
         for length_s in LENGTHS_S:
             found = windows(recording, length_s, hop_s=HOP_S.get(length_s, 2.5))
             off = [abs(one.lag_ms - HALF_FRAME_MS) / one.sigma_ms for one in found if one.used]
-            name, note = f"trial {path.stem[:2]}: {length_s:g} s", f"{len(off)} windows"
-            worst = max(off, default=0.0)
-            figures.append(Result(name, worst, MOST_SIGMAS, unit="sd", note=note))
+            figures.append(worst_ratio(f"trial {path.stem[:2]}: {length_s:g} s", off))
     period_s, height_ms = stamp_sawtooth(whole(data, FAST))
     return [
         *figures,
