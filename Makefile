@@ -8,7 +8,7 @@ STAMP  := $(VENV)/.installed
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help install compiled demo test test-compiled test-experiments test-cameras test-cpu test-root faults endurance load fuzz test-vm lint types imports bench bench-full docs pictures wheel deb sbom release vendor audit lock mutation clean
+.PHONY: help install compiled demo test test-compiled test-experiments test-cameras test-cpu test-root test-arm faults endurance load fuzz test-vm lint types imports bench bench-full docs pictures wheel deb sbom release vendor audit lock mutation clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -53,6 +53,9 @@ test-cpu: $(STAMP)  ## the numerical tests as on other processors (ARGS=--all: a
 test-root:  ## the tests and the demo on a fresh minimal Debian, as a user without root (mmdebstrap; root or sudo); ARGS="--suite trixie"
 	@$(PYTHON) .ci/minimal_root.py $(ARGS)
 
+test-arm: $(STAMP)  ## the arm64 package in emulation: version, doctor, replay, tests without time limits; hours (mmdebstrap, qemu-user-static, root)
+	@$(BIN)/python .ci/arm_root.py $(ARGS)
+
 test-vm: $(STAMP)  ## virtual machines: SocketCAN on a real vcan; power cuts; the .deb under real systemd, with broker and faults
 	@$(BIN)/python .ci/light_vm.py
 	@$(BIN)/python .ci/power_cut.py
@@ -78,7 +81,7 @@ $(VENV)/.mutation: $(STAMP)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock --group mutation
 	@touch $@
 
-mutation: $(VENV)/.mutation  ## do tests notice small changes of protocols, timing, fusion and calibration record: 300 mutants (hours); ARGS="--mutants 20"
+mutation: $(VENV)/.mutation  ## do tests notice small changes of protocols, timing, fusion and calibration record: 200 mutants (ARGS="--mutants 20 --jobs 2")
 	@OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.mutation $(ARGS)
 
 lint: $(STAMP)  ## ruff: rules and format

@@ -1,11 +1,14 @@
-"""Check that systemd can read the systemd units, and that their exposure is at most 1.2."""
+"""Check that systemd can read the units and drop-ins, and that the exposure is at most 1.2."""
 
 import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
-UNITS = sorted((Path(__file__).resolve().parents[1] / "systemd").glob("jointfitd*.service"))
+SYSTEMD = Path(__file__).resolve().parents[1] / "systemd"
+UNITS = sorted(SYSTEMD.glob("jointfitd*.service"))
+DROP_INS = sorted(SYSTEMD.glob("jointfitd*.conf"))
 THRESHOLD = "12"  # tenths, as in systemd-analyze
 ELSEWHERE = "/usr/bin/jointfitd"
 """Program in ExecStart. It is not installed on a machine that only checks the unit."""
@@ -23,7 +26,13 @@ def analyze(unit: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 def complaints(unit: Path) -> list[str]:
     """Return the defects of a unit."""
-    lines = analyze(unit, "verify", "--man=no").stderr.splitlines()
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(shutil.copy(unit, folder))
+        drop_ins = Path(f"{copy}.d")
+        drop_ins.mkdir()
+        for drop_in in DROP_INS:
+            shutil.copy(drop_in, drop_ins)
+        lines = analyze(copy, "verify", "--man=no").stderr.splitlines()
     wrong = [line for line in lines if "jointfitd" in line and ELSEWHERE not in line]
     security = analyze(unit, "security", "--offline=yes", f"--threshold={THRESHOLD}", "--no-pager")
     print(*security.stdout.splitlines()[-1:], security.stderr.strip())

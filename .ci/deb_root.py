@@ -4,7 +4,7 @@
 
 Each system is mmdebstrap's minbase with the packages on which ours depends. Root installs the
 package; an ordinary user runs the demo. The demo runs in real time, so it has two attempts. Only
-the set-up needs root (or sudo).
+the set-up needs root (or sudo). `.ci/arm_root.py` runs the tests in such a system.
 
 The exit status is 1 if the demo failed, or 2 if a system cannot be set up.
 """
@@ -12,7 +12,7 @@ The exit status is 1 if the demo failed, or 2 if a system cannot be set up.
 from __future__ import annotations
 
 import argparse
-import os
+import platform
 import re
 import shlex
 import subprocess
@@ -20,11 +20,10 @@ import sys
 import tempfile
 from pathlib import Path
 
-from debian_root import CACHE, SEARCH, RootBuildError, bootstrap, kept, run
+from debian_root import CACHE, RootBuildError, bootstrap, enter, kept
 
 SUITES = ("trixie",)
 """Releases other than that of the virtual machine with the service."""
-DEMO = "jointfit demo --headless --seconds 10"
 SET_UP = """\
 set -eu
 root={work}/root
@@ -38,10 +37,15 @@ chroot "$root" dpkg -i /package.deb
 echo stranger:x:1000:1000::/tmp:/bin/sh >> "$root/etc/passwd"
 inside() {{
   chroot --userspec=1000:1000 --groups= "$root" \\
-    env -i HOME=/tmp PATH=/usr/bin:/bin LANG=C.UTF-8 sh -c "cd /tmp && $1"
+    env -i HOME=/tmp PATH=/usr/bin:/bin LANG=C.UTF-8 OPENBLAS_NUM_THREADS=1 sh -c "cd /tmp && $1"
 }}
-echo "Debian $(cat "$root/etc/debian_version"): jointfit $(inside 'jointfit --version')"
-inside {demo} || {{ echo 'the demo failed: once more'; inside {demo}; }}
+echo "Debian $(cat "$root/etc/debian_version"): $(chroot "$root" uname -m)," \\
+  "jointfit $(inside 'jointfit --version')"
+"""
+"""Shell commands that install the package and define `inside`, which runs a command as a user."""
+DEMO = """\
+demo='jointfit demo --headless --seconds 10'
+inside "$demo" || { echo 'the demo failed: once more'; inside "$demo"; }
 chroot "$root" dpkg -r jointfitd
 if [ -e "$root/usr/lib/jointfitd" ]; then
   echo 'the removal left files:'
@@ -58,40 +62,43 @@ def main() -> int:
     parser.add_argument("package", type=Path)
     given = parser.parse_args()
     try:
-        return max(_check(given.package.resolve(), suite) for suite in given.suite)
+        return max(int(with_package(given.package, suite, DEMO) != 0) for suite in given.suite)
     except RootBuildError as error:
         print(f"deb_root: {error}", file=sys.stderr)
         return 2
 
 
-def _check(package: Path, suite: str) -> int:
-    needed = _needed(package)
+def with_package(package: Path, suite: str, script: str) -> int:
+    """Install a package in a new system, run a shell script after `SET_UP`; return its status."""
+    if not package.is_file():
+        raise RootBuildError(f"{package}: no such package: make deb")
+    architecture = field(package, "Architecture")
+    needed = re.sub(r"\(.*?\)", "", field(package, "Depends")).replace(",", " ").split()
+    needed = list(dict.fromkeys(needed))
     tar = kept(
-        "package.tar", " ".join(needed), {"mmdebstrap": "mmdebstrap"},
-        lambda work: bootstrap(needed, (), work, suite), suite=suite,
+        f"package-{architecture}.tar", " ".join(needed), tools_for(architecture),
+        lambda work: bootstrap(needed, (), work, suite, architecture), suite=suite,
     )  # fmt: skip
-    root = [] if os.geteuid() == 0 else ["sudo", "-n"]
     work = Path(tempfile.mkdtemp(prefix="package-run-", dir=CACHE))
-    paths = {"work": work, "tar": tar, "package": package, "demo": DEMO}
-    script = SET_UP.format_map({name: shlex.quote(str(each)) for name, each in paths.items()})
-    enter = ["unshare", "--mount", "--propagation=private", "--pid", "--fork", "--kill-child"]
-    try:
-        ended = subprocess.run(  # noqa: S603 - our own script
-            [*root, *enter, "sh", "-c", script],
-            check=False, stdin=subprocess.DEVNULL, env=os.environ | {"PATH": SEARCH},
-        )  # fmt: skip
-    finally:
-        run([*root, "rm", "-rf", "--one-file-system", str(work)], CACHE)
-    return int(ended.returncode != 0)
+    paths = {"work": work, "tar": tar, "package": package.resolve()}
+    set_up = SET_UP.format_map({name: shlex.quote(str(each)) for name, each in paths.items()})
+    return enter(set_up + script, work)
 
 
-def _needed(package: Path) -> list[str]:
-    """Return the names of the packages on which a package depends."""
-    field = subprocess.run(  # noqa: S603 - as below
-        ["dpkg-deb", "-f", str(package), "Depends"],  # noqa: S607 - Debian's
+def tools_for(architecture: str) -> dict[str, str]:
+    """Return the programs that make a system of an architecture, each with its Debian package."""
+    tools = {"mmdebstrap": "mmdebstrap"}
+    if architecture == "arm64" and platform.machine() != "aarch64":
+        tools["qemu-aarch64-static"] = "qemu-user-static binfmt-support"
+    return tools
+
+
+def field(package: Path, name: str) -> str:
+    """Return a field of the control file of a package."""
+    return subprocess.run(  # noqa: S603 - as below
+        ["dpkg-deb", "-f", str(package), name],  # noqa: S607 - Debian's
         text=True, capture_output=True, check=True,
-    ).stdout  # fmt: skip
-    return list(dict.fromkeys(re.sub(r"\(.*?\)", "", field).replace(",", " ").split()))
+    ).stdout.strip()  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 SUITE = "bookworm"
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jointfitd"
 SEARCH = os.environ.get("PATH", "") + ":/usr/sbin:/sbin"
+NAMESPACES = ("--mount", "--propagation=private", "--pid", "--fork", "--kill-child")
+"""Options of unshare. No mount and no process outlives the command."""
 _KEPT_DAYS = 21
 
 
@@ -73,20 +75,34 @@ def kept(
         if time.time() - old.stat().st_mtime > _KEPT_DAYS * 86400:  # noqa: TID251 - a file's age
             old.unlink()
 
-    absent = [deb for tool, deb in tools.items() if shutil.which(tool, path=SEARCH) is None]
-    if absent:
-        raise RootBuildError(f"apt install {' '.join(absent)}")
+    require(tools)
     with tempfile.TemporaryDirectory(prefix=f"{stem}-", dir=cache) as scratch:
         make(Path(scratch)).replace(path)
     return path
 
 
+def require(tools: Mapping[str, str]) -> None:
+    """Raise `RootBuildError` with the Debian packages of programs that are missing."""
+    absent = [deb for tool, deb in tools.items() if shutil.which(tool, path=SEARCH) is None]
+    if absent:
+        raise RootBuildError(f"apt install {' '.join(absent)}")
+
+
 def bootstrap(
-    packages: Sequence[str], hooks: Sequence[str], work: Path, suite: str = SUITE
+    packages: Sequence[str],
+    hooks: Sequence[str],
+    work: Path,
+    suite: str = SUITE,
+    architecture: str | None = None,
 ) -> Path:
-    """Make ``rootfs.tar`` in `work` from minbase and `packages`, without manual pages."""
+    """Make ``rootfs.tar`` in `work` from minbase and `packages`, without manual pages.
+
+    The default of `architecture` is that of this machine. QEMU emulates any other.
+    """
     # An old mirror of unstable hides no security updates, because unstable has none.
     options = ["--aptopt=Acquire::Check-Valid-Until no"] if suite == "sid" else []
+    if architecture is not None:
+        options.append(f"--architectures={architecture}")
     command = [
         "mmdebstrap", "--variant=minbase", f"--include={','.join(packages)}",
         "--dpkgopt=path-exclude=/usr/share/man/*", "--dpkgopt=path-exclude=/usr/share/locale/*",
@@ -94,6 +110,22 @@ def bootstrap(
     ]  # fmt: skip
     run(command, work)
     return work / "rootfs.tar"
+
+
+def become_root() -> list[str]:
+    """Return the words before a command that needs root."""
+    return [] if os.geteuid() == 0 else ["sudo", "-n"]
+
+
+def enter(script: str, work: Path, namespaces: Sequence[str] = NAMESPACES) -> int:
+    """Run a shell script as root in new namespaces, delete `work`, and return the exit status."""
+    try:
+        return subprocess.run(  # noqa: S603 - our own scripts
+            [*become_root(), "unshare", *namespaces, "sh", "-c", script],
+            check=False, stdin=subprocess.DEVNULL, env=os.environ | {"PATH": SEARCH},
+        ).returncode  # fmt: skip
+    finally:
+        run([*become_root(), "rm", "-rf", "--one-file-system", str(work)], CACHE)
 
 
 def run(words: list[str], work: Path) -> None:

@@ -23,7 +23,18 @@ import tempfile
 import time
 from pathlib import Path
 
-from debian_root import CACHE, SEARCH, SUITE, RootBuildError, bootstrap, kept, run
+from debian_root import (
+    CACHE,
+    NAMESPACES,
+    SEARCH,
+    SUITE,
+    RootBuildError,
+    become_root,
+    bootstrap,
+    enter,
+    kept,
+    run,
+)
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 PACKAGES = ("python3", "python3-venv", "make", "git", "ca-certificates")
@@ -104,42 +115,33 @@ def main() -> int:
     given.out.mkdir(parents=True, exist_ok=True)
     for old in given.out.glob("*.xml"):
         old.unlink()
-    root = [] if os.geteuid() == 0 else ["sudo", "-n"]
     try:
         tar = kept(
             "minimal.tar", " ".join(PACKAGES), {"mmdebstrap": "mmdebstrap"},
             lambda work: bootstrap(PACKAGES, (), work, given.suite), suite=given.suite,
         )  # fmt: skip
+        # `enter` deletes the folder, whose files then belong to root.
         work = Path(tempfile.mkdtemp(prefix="minimal-run-", dir=CACHE))
-        try:
-            run(["git", "clone", "-q", "--depth=1", f"file://{CHECKOUT}", "checkout"], work)
-            script = _script(work, tar, given.out.resolve(), command)
-            ended = subprocess.run(  # noqa: S603 - our own script
-                [*root, *_namespaces(root), "sh", "-c", script],
-                check=False, stdin=subprocess.DEVNULL, env=os.environ | {"PATH": SEARCH},
-            )  # fmt: skip
-        finally:
-            run([*root, "rm", "-rf", "--one-file-system", str(work)], CACHE)
+        run(["git", "clone", "-q", "--depth=1", f"file://{CHECKOUT}", "checkout"], work)
+        return enter(_script(work, tar, given.out.resolve(), command), work, _namespaces())
     except RootBuildError as error:
         print(f"minimal_root: {error}", file=sys.stderr)
         return 2
-    return ended.returncode
 
 
-def _namespaces(root: list[str]) -> list[str]:
-    """Return the command that enters new namespaces, in which no process outlives the command."""
-    enter = ["unshare", "--mount", "--propagation=private", "--pid", "--fork", "--kill-child"]
+def _namespaces() -> tuple[str, ...]:
+    """Return the namespaces, and the start of the clocks if this kernel can set it."""
     monotonic = UPTIME_S - int(time.clock_gettime(time.CLOCK_MONOTONIC))
     boottime = UPTIME_S - int(time.clock_gettime(time.CLOCK_BOOTTIME))
     clocks = ["--time", f"--monotonic={monotonic}", f"--boottime={boottime}"]
     tried = subprocess.run(  # noqa: S603 - as below
-        [*root, *enter, *clocks, "true"],
+        [*become_root(), "unshare", *NAMESPACES, *clocks, "true"],
         check=False, capture_output=True, env=os.environ | {"PATH": SEARCH},
     )  # fmt: skip
     if tried.returncode == 0:
-        return [*enter, *clocks]
+        return (*NAMESPACES, *clocks)
     print("minimal_root: this kernel allows no time namespace; the uptime is the host's")
-    return enter
+    return NAMESPACES
 
 
 def _script(work: Path, tar: Path, out: Path, command: str) -> str:

@@ -93,8 +93,9 @@ def module_list(root: Path = ROOT) -> dict[str, list[str]]:
 def is_current(out: Path, groups: dict[str, list[str]] | None = None, level: str = LEVEL) -> bool:
     """Return whether `out` contains extension modules of the current sources."""
     stamp = out / STAMP
-    digest = _digest(groups or module_list(), level)
-    return stamp.is_file() and stamp.read_text(encoding="utf-8") == digest
+    if not stamp.is_file() or compiler() is None:
+        return False
+    return stamp.read_text(encoding="utf-8") == _digest(groups or module_list(), level)
 
 
 def compile_modules(out: Path, groups: dict[str, list[str]], level: str = LEVEL) -> Path:

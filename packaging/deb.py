@@ -76,6 +76,7 @@ SYSTEM_FILES = {
     "systemd/70-jointfitd.rules": "usr/lib/udev/rules.d",
     "packaging/completions/jointfit.bash": "usr/share/bash-completion/completions",
     "systemd/jointfitd-can.conf": "usr/share/jointfitd/systemd",
+    "systemd/jointfitd-realtime.conf": "usr/share/jointfitd/systemd",
     "systemd/80-jointfit-can0.network": "usr/share/jointfitd/networkd",
     "systemd/mosquitto/jointfitd.conf": "usr/share/jointfitd/mosquitto",
     "systemd/mosquitto/jointfitd.acl": "usr/share/jointfitd/mosquitto",
@@ -260,7 +261,7 @@ def _install_files(tree: Path) -> None:
 
 
 def _install_documents(tree: Path, version: str, epoch: int) -> None:
-    """Install manual pages, licence and changelogs at the paths that Debian's policy requires."""
+    """Install manual pages, licence, changelogs and lintian's exceptions at the paths of Debian."""
     documents, manuals = tree / "usr/share/doc/jointfitd", tree / "usr/share/man/man1"
     manuals.mkdir(parents=True)
     for page in sorted((DEBIAN.parent / "man").glob("*.1")):
@@ -270,6 +271,9 @@ def _install_documents(tree: Path, version: str, epoch: int) -> None:
     text = (DEBIAN / "copyright").read_text(encoding="utf-8").rstrip("\n")
     (documents / "copyright").write_text(f"{text}\n{indented}", encoding="utf-8")
     _compress(documents / "changelog.gz", (ROOT / "CHANGELOG.md").read_bytes())
+    overrides = tree / "usr/share/lintian/overrides"
+    overrides.mkdir(parents=True)
+    shutil.copyfile(DEBIAN / "lintian-overrides", overrides / "jointfitd")
     entry = (
         f"jointfitd ({version}) stable; urgency=medium\n\n  * See changelog.gz.\n\n"
         f" -- {MAINTAINER}  {formatdate(epoch)}\n"

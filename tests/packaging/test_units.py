@@ -68,6 +68,19 @@ def test_unit_passes_the_credentials_that_the_daemon_reads() -> None:
     assert all(f"/etc/credstore/{name}" in GUIDE for name in named)
 
 
+def test_drop_in_gives_only_the_main_thread_real_time_priority() -> None:
+    drop_in = dict(directives(SYSTEMD / "jointfitd-realtime.conf"))
+    assert drop_in == {
+        "CPUSchedulingPolicy": "rr",
+        "CPUSchedulingPriority": "10",
+        "CPUSchedulingResetOnFork": "yes",
+    }
+    assert f"SCHED_RR|SCHED_RESET_ON_FORK, priority {drop_in['CPUSchedulingPriority']}" in GUIDE
+    builder = (ROOT / "packaging" / "deb.py").read_text()
+    assert '"systemd/jointfitd-realtime.conf": "usr/share/jointfitd/systemd"' in builder
+    assert "/usr/share/jointfitd/systemd/jointfitd-realtime.conf" in GUIDE
+
+
 def test_units_are_read_without_complaint_and_little_is_exposed() -> None:
     if shutil.which("systemd-analyze") is None:
         pytest.skip("systemd is not installed (Debian: apt install systemd)")

@@ -103,3 +103,12 @@ def test_a_codec_of_another_package_extends_the_one_of_this_installation() -> No
     assert codec.feed(b"b??\x02c\x02") == [(b"b", 4), CorruptBytes(2, NO_START), (b"c", 8)]
     assert codec.flush() == [CorruptBytes(1, CUT_OFF)]
     assert (codec.messages, codec.discarded, codec.silences) == (3, 3, 1)
+
+
+def test_compiled_modules_are_not_current_without_a_compiler(tmp_path: Path) -> None:
+    (tmp_path / ".digest").write_text("digest of an earlier build")
+    done = subprocess.run(
+        [sys.executable, ROOT / "packaging" / "compiled.py", "--check", "--out", tmp_path],
+        env=os.environ | {"PATH": "/none"}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (1, "")
