@@ -6,7 +6,7 @@ select_variant(__path__)
 
 
 def __getattr__(name: str) -> str:
-    """Return ``__version__``, read on demand: the metadata of packages is slow to import."""
+    """Return ``__version__``, which is read on demand because the metadata is slow to load."""
     if name != "__version__":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib.metadata import PackageNotFoundError, version  # noqa: PLC0415 - on demand

@@ -179,9 +179,9 @@ class CanBusSettings(Settings):
         1_000_000,
         ge=10_000,
         le=1_000_000,
-        description="speed of the bus, bit/s, the same as of all its devices; for `socketcan` it "
-        "is set by `ip link set can0 up type can bitrate 1000000`, and used here only to check "
-        "the load",
+        description="speed of the bus and of all its devices, bit/s; for `socketcan`, the command "
+        "`ip link set can0 up type can bitrate 1000000` sets it, and this key is used only to "
+        "check the load",
     )
     baud: int = Field(
         115_200,
@@ -225,7 +225,7 @@ class ImuSettings(Settings):
 
     id: str = Field(description="name of the sensor; becomes an MQTT topic")
     segment: str = Field(description="segment of [chain] to which the sensor is attached")
-    driver: str = Field(description="driver name, as `jointfit check` lists them")
+    driver: str = Field(description="driver name; `jointfit check` lists all names")
     rate_hz: float = Field(
         100.0, gt=0, le=2000, description="sample rate requested of the device, Hz"
     )

@@ -1,6 +1,6 @@
 """Factors of conversions between units.
 
-The factors of time are integers, so that nanoseconds divided by them are rounded once.
+`NS_PER_S` and `NS_PER_MS` are integers, so that nanoseconds divided by them are rounded once.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ NS_PER_S: Final = 1_000_000_000
 NS_PER_MS: Final = 1_000_000
 """Nanoseconds per millisecond."""
 S_PER_NS: Final = 1e-9
-"""Seconds per nanosecond. A product is cheaper than a quotient where every sample needs it."""
+"""Seconds per nanosecond. Code that runs for every sample multiplies, because a division takes
+longer."""
 S_PER_US: Final = 1e-6
 """Seconds per microsecond."""
 MM_PER_M: Final = 1000.0
@@ -20,4 +21,4 @@ MM_PER_M: Final = 1000.0
 M_PER_MM: Final = 1e-3
 """Metres per millimetre."""
 STANDARD_GRAVITY: Final = 9.80665
-"""Acceleration of which devices report multiples as ``g``, m/s^2 (ISO 80000-3)."""
+"""Standard acceleration of gravity, m/s^2 (ISO 80000-3). Devices use it as the unit ``g``."""

@@ -112,8 +112,8 @@ class FitResult:
     kept: str | None = None
     """Reason why a refit does not replace the current models."""
     notes: tuple[str, ...] | None = None
-    """One sentence for each sensor that appears re-donned since the current calibration. None if
-    no calibration is in use.
+    """One sentence for each sensor that moved relative to another sensor of its segment since the
+    current calibration. None for other jobs than `StaticJob`, and without a current calibration.
     """
     refused: str | None = None
     """Reason why there is no result; the other fields are then unused."""

@@ -248,15 +248,17 @@ class RegressionQuality:
 
     sensors: tuple[str, ...]
     q_sign: Quaternion
-    """Reference quaternion. Before the regression, the sign of a quaternion is changed if the dot
-    product of both is negative.
+    """Reference quaternion. Before the regression, every quaternion whose dot product with the
+    reference quaternion is negative changes its sign.
     """
     verified: tuple[tuple[float, ...], ...]
     """Coefficients that were fitted to the first part of the trial. ``holdout`` contains their
     errors.
     """
     stored: tuple[tuple[float, ...], ...]
-    """Coefficients that were fitted to the whole trial and are used by the fusion."""
+    """Coefficients that the fusion uses. They were fitted to the whole trial, in the procedure
+    ``patent`` to its first part.
+    """
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,7 +47,8 @@ def fuse_centers(estimates: Sequence[CenterEstimate], *, robust: bool = True) ->
         noise of the parent's markers causes is common to all estimates and is not modeled here;
         `RunningSphere` models this error.
     robust : bool
-        Whether to reduce the weight of estimates that contradict the others.
+        Whether to reduce the weight of estimates that contradict the others. This requires at least
+        three estimates.
 
     Returns
     -------
@@ -57,7 +58,7 @@ def fuse_centers(estimates: Sequence[CenterEstimate], *, robust: bool = True) ->
     Raises
     ------
     ValueError
-        No estimates.
+        `estimates` is empty.
     """
     if not estimates:
         raise ValueError("no estimates to fuse")

@@ -3,7 +3,7 @@ r"""Trajectory of a joint in the world, from the centers of rotation fixed in tw
 A center of rotation is estimated once, in the coordinates of a segment. The position of the joint
 in every frame is then computed from the pose of the segment, even if the other segment is occluded.
 
-Invariant: a frame without a pose of either segment has no position (NaN).
+Invariant: in a frame in which neither segment has a pose, the position is unknown (NaN).
 """
 
 from __future__ import annotations
@@ -80,9 +80,10 @@ def joint_trajectory(sides: Sequence[JointSide], frames: int) -> JointTrajectory
     observed to predicted difference.
 
     Along a direction that only one side observed, the position is computed from this side. Along a
-    direction that neither side observed, the position is computed from the first side. The second
-    side is then shifted to agree with the first side on average. For a planar method this direction
-    is the normal, and the position along the normal is the mean of the segment's markers.
+    direction that neither side observed, the position is computed from the side with fewer
+    unobserved directions. The other side is then shifted to agree with this side on average. For a
+    planar method this direction is the normal, and the position along the normal is the mean of the
+    segment's markers.
 
     Parameters
     ----------
@@ -147,7 +148,7 @@ def _agreeing_track(side: JointSide, reference: Array) -> Array:
         center = center + unseen.T @ (unseen @ (other[shared].mean(axis=0) - center))
 
     found = _in_world(side, center)
-    if len(center) == len("xy"):  # normal to the plane, the mean of the markers is used
+    if len(center) == len("xy"):  # along the normal of the plane, both tracks get the same mean
         normal = np.cross(*side.basis.T)
         found = found + normal * ((reference - found)[shared] @ normal).mean()
     return found

@@ -52,7 +52,9 @@ class EstimationMethod:
     needs: tuple[str, ...]
     """Fields of `Movement` that must be given: ``points``, ``parent`` and ``child``, ``angles``."""
     planar: bool
-    """Whether the method works in a plane; points in space are projected along `Movement.axis`."""
+    """Whether the method accepts points in a plane. Circle methods project points in space along
+    `Movement.axis`.
+    """
     run: Callable[..., CenterEstimate]
     """Function that returns the estimate. Its arguments are the movement and the fields in
     `needs`."""

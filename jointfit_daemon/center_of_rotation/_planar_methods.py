@@ -45,8 +45,8 @@ OFF_AXIS = (
     "or score, or give the axis"
 )
 LIMITS = CircleLimits(sd=inf)
-"""Acceptance limits without a limit on the error. The user selected the method, so every result is
-returned, with its uncertainty.
+"""Acceptance limits without a limit on the error. The user selected the method, so a center with a
+large error is returned, with its uncertainty.
 """
 _GRID_STEP_M = 0.005
 

@@ -33,8 +33,8 @@ class CenterEstimate:
     noise: float
     """Standard deviation of each coordinate of a point, estimated from the residuals, m."""
     residual: float
-    """RMS residual, m. It is radial, or for SCoRE the distance between the points of the two
-    segments.
+    """RMS residual, m. For SCoRE a residual is the distance between the points of the two segments,
+    for other methods it is radial.
     """
     radii: Array
     """Distance of each marker from the center, m, shape (k,)."""

@@ -110,7 +110,7 @@ def least_load(settings: Any, unknown: Iterable[str]) -> Any:
 
 
 def _choices(field: FieldInfo) -> list[Any]:
-    """Return all values of a Boolean or a choice, or the default of an inner table; else none.
+    """Return all values of a Boolean or a choice, the default of an inner table, or an empty list.
 
     Identifiers count as one value, because they do not change the load.
     """

@@ -82,7 +82,7 @@ def check_topic_name(key: str, name: str) -> list[Fault]:
     if bad := [letter for letter in _FORBIDDEN if letter in name]:
         return [Fault(key, f"must not contain {' '.join(bad)}: it becomes an MQTT topic", name)]
     if name.startswith("$") or not name.isprintable() or name != name.strip():
-        what = "must not begin with $, nor contain control characters or outer blanks"
+        what = "must not begin with $, contain control characters, or begin or end with a blank"
         return [Fault(key, f"{what}: it becomes an MQTT topic", name)]
     return []
 
@@ -158,7 +158,7 @@ def _check_values_by_name(table: ChainTable) -> Iterator[Fault]:
 
 
 def check_durations(table: CalibrationTable) -> Iterator[Fault]:
-    """Check that ``functional_s`` is at least ``functional_min_s``; wrong keys are None."""
+    """Check that ``functional_s`` is at least ``functional_min_s``; faulty keys are None."""
     longest, shortest = table.functional_s, table.functional_min_s
     if None not in (longest, shortest) and longest < shortest:
         text = f"is shorter than functional_min_s = {shortest:g}: increase it, or decrease that key"
@@ -220,14 +220,14 @@ def check_sensors(imus: Sequence[Mapping[str, Any]], table: ChainTable | None) -
             key = f"imu[{imu_name(imu, at)}].segment"
             yield from check_known_name(key, imu["segment"], table.segments, "segment")
     if any(not isinstance(imu.get("segment"), str) for imu in imus):
-        return  # already reported; this sensor may be on any segment
+        return  # the sensor with this fault, which is reported already, may be on any segment
     for segment in table.segments:
         if segment not in worn and table.motion != "planar":
             yield Fault("imu", f"segment {segment!r} has no sensor, expected at least one")
 
 
 def body_parts_of(table: ChainTable) -> list[str]:
-    """Return the segments and the body parts with markers only; keys with faults are None."""
+    """Return the segments and the body parts with markers only. Keys that had faults are None."""
     ends = [joint.child for joint in table.joint or ()]
     parts = [table.proximal, *(table.segments or ()), *ends, table.distal]
     return list(dict.fromkeys(part for part in parts if part))
@@ -340,7 +340,7 @@ def check_center_methods(
 
 
 def _sides_of_joints(chain: ChainTable) -> dict[str, list[tuple[str | None, str]]]:
-    """Return the two body parts of each joint (None if missing), each with its key."""
+    """Return the two body parts of each joint (None if missing), each with the key that sets it."""
     if chain.joint:
         return {
             joint.name: [(joint.parent, ""), (joint.child, f"chain.joint[{joint.name}].child")]

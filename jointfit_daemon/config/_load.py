@@ -129,9 +129,9 @@ class _RigReader:
         self.partial: dict[str, Any] = {}
         """Partial models of the tables with faults, by key, for checks across tables."""
         self.cameras: MocapSettings | None = None
-        """The ``[mocap]`` table, including tables with faults."""
+        """The ``[mocap]`` table, even if it has faults."""
         self.imus_read: list[Source] = []
-        """All IMUs whose tables are readable, including tables with faults."""
+        """All IMUs whose tables are readable, even if the tables have faults."""
         self.imus_with_load: list[Source] = []
         """IMUs of `imus_read` whose load is known. Wrong choices count with the smallest load."""
         for key in table:

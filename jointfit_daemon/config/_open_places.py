@@ -19,7 +19,7 @@ LATER = "later"
 """Word that replaces a device, identifiers or names that are not known yet."""
 _FEW = 4
 """Number of placeholder markers in an open place. No check requires more markers."""
-_AGAIN = "`jointfit init FOLDER --force` asks for the open places only"
+_AGAIN = "`jointfit init FOLDER --force` asks for the missing values only"
 _PORT = (
     "not filled in yet: connect the sensor and enter its serial port, which `jointfit probe` lists;"
     f" or, for a sensor on a CAN bus, its driver, can and ids. {_AGAIN}"

@@ -116,7 +116,7 @@ class ChainTable(Settings):
 
 
 class ChainRefinementTable(Settings):
-    """``[calibration.chain_refinement]``: options as those of ``jointfit markers``."""
+    """``[calibration.chain_refinement]``: the same options as those of ``jointfit markers``."""
 
     method: RefinementMethod = Field(
         "joint", description="`joint`: poses and markers in one solve; `block`, or `search` (slow)"
@@ -139,7 +139,10 @@ class ChainRefinementTable(Settings):
         (), description='markers whose locks in the model are ignored; "*" for all'
     )
     holdout: float = Field(
-        0.0, ge=0, le=0.5, description="last share of the training part, for early stopping"
+        0.0,
+        ge=0,
+        le=0.5,
+        description="share at the end of the training part that decides when to stop",
     )
     frames: int = Field(
         150, ge=10, le=1000, description="largest number of frames of each part, evenly spaced"
@@ -424,7 +427,7 @@ class LslSettings(Settings):
 
     name: str = Field(
         "",
-        description="begins the names of both streams; default: [rig] name",
+        description="prefix of the names of both streams; default: [rig] name",
     )
 
 

@@ -14,8 +14,9 @@ def add_heading_sd(
 ) -> tuple[tuple[SegmentState, ...], tuple[JointState, ...]]:
     r"""Return segments and joints with a common heading error of standard deviation `sd`, rad.
 
-    The heading error is a rotation about one of three axes, and standard deviations are per axis.
-    The error rotates all positions about the first joint:
+    The heading error is a rotation about only one of three axes. Its contribution to the standard
+    deviation per axis of an orientation is therefore `sd` / √3. The error rotates all positions
+    about the first joint:
 
     .. math:: \sigma^2 \leftarrow \sigma^2 + \tfrac13 \sigma_h^2 (\Delta x^2 + \Delta y^2)
 

@@ -36,7 +36,7 @@ class OpticalReading(NamedTuple):
     """Orientation q_optical_segment of each segment."""
     positions: list[Vector | None]
     """Joint centers, m. Each is the mean of two centers, which are fixed in the two adjacent body
-    parts.
+    parts. If only one part is visible, the center fixed in this part is used alone.
     """
     gaps: list[float | None]
     """Distance between these two centers at each joint, m."""

@@ -47,9 +47,9 @@ class PatentSegmentFuser(SegmentFuser):
     def fuse(self, t_ns: int, inputs: Inputs, neighbor: Sequence[str]) -> FusedSegment:
         """Return the regression at `t_ns`, with the flag ``lost`` if a sensor is missing.
 
-        A regression output with a norm near 0 determines no orientation, so the segment is ``lost``
-        and ``untrained``. `neighbor` is ignored, because the regression of the patent does not use
-        it.
+        A regression output with a norm below 0.5 determines no orientation, so the segment is
+        ``lost`` and ``untrained``. `neighbor` is ignored, because the regression of the patent does
+        not use it.
         """
         lost = FrameFlag.LOST.of(self._name)
         if any(name not in inputs for name in self._sensors):

@@ -206,7 +206,7 @@ def average(q: ArrayLike, weights: ArrayLike | None = None) -> Array:
     Raises
     ------
     ValueError
-        No rotations.
+        There are no rotations.
     """
     q = _floats(q)
     if q.shape[-2] == 0:

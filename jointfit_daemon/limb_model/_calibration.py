@@ -102,7 +102,9 @@ class JointCalibration:
     sd: float | None
     """Standard deviation of the position (root mean variance per axis), m."""
     source: str
-    """``fit`` | ``length`` | ``unknown``."""
+    """Source of the center: ``fit`` (movement), ``length`` (neighboring center and configured
+    length), ``midpoint`` (middle between two joints) or ``unknown``.
+    """
     residual_rms: float | None = None
     """RMS residual of the distances between the markers and the center, m."""
     gap_rms: float | None = None
@@ -231,7 +233,7 @@ def model_key(sensors: Sequence[str], other: str | None) -> str:
 def _from_dict(data: Mapping[str, Any]) -> Calibration:
     correlations = {name: float(rho) for name, rho in data.get("correlations", {}).items()}
     if wrong := [rho for rho in correlations.values() if not -1.0 < rho < 1.0]:
-        raise ValueError(f"correlation {wrong[0]}")
+        raise ValueError(f"correlation {wrong[0]}, expected a value between -1 and 1")
 
     return Calibration(
         method=cast("Method", data["method"]),

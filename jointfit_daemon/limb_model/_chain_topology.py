@@ -45,10 +45,12 @@ def distal_joints(chain: Chain, segment: int) -> list[int]:
 
 
 def branch_runs(chain: Chain) -> list[list[int]]:
-    """Return runs of joints that are above each other when standing, from proximal to distal.
+    """Return the runs of joints that are above each other while the subject stands.
 
-    A limb without branches is one run. In a branched limb, each of the two distal joints of the
-    first segment starts a run.
+    The joints of a run are in the order from proximal to distal.
+
+    A limb without branches is one run. In a branched limb, the first joint is a run, and each of
+    the two distal joints of the first segment starts a run.
     """
     runs: list[list[int]] = []
     starts = [0]

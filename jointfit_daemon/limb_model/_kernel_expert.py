@@ -2,8 +2,9 @@ r"""One soft-tissue correction by kernel ridge regression.
 
 .. math:: c(u) = \mathrm{clip}(C^T [s(u), a_{z_1}(u / \ell) \dots a_{z_m}(u / \ell)])
 
-where s are the smooth terms and a the anchored bumps of `_kernel_features`. An expert returns its
-correction and the leverage of the frame. `KernelModel` combines two experts.
+where u are the regressors, s the smooth terms and a the anchored bumps of `_kernel_features`. C are
+the coefficients, z the centers of the bumps, and :math:`\ell` is the kernel width. An expert
+returns its correction and the leverage of the frame. `KernelModel` combines two experts.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ class KernelExpert:
     """Fitted correction of one segment."""
 
     width: float
-    """Kernel width, rad; one of ``WIDTHS``."""
+    """Kernel width, rad."""
     tilted: bool
     """Whether the tilt of the segment is one of the regressors."""
     coefficients: Rows

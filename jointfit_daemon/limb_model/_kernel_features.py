@@ -50,7 +50,7 @@ def relative_rotations(sensors: Sequence[Array], mean: Array, q_other: Array) ->
     mean : ndarray, shape (n, 4)
         Mean of the sensors.
     q_other : ndarray, shape (n, 4)
-        Bone-aligned orientation of the neighbouring segment.
+        Bone-aligned orientation of the neighboring segment.
     """
     inverse = rotation.conjugate(sensors[0])
     k = rotation.log(rotation.multiply(rotation.conjugate(mean), q_other))

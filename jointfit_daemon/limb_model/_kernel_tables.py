@@ -38,7 +38,8 @@ class KernelTables:
     terms: Array
     """Matrix of the first product, shape (bumps + p + q + 8, 2 width + 7).
 
-    The product with [bends, u, u^2, 1] contains the exponents of all bumps, the roots of both
+    The two experts have p and q smooth terms, and *width* is the number of regressors u. The
+    product with [bends, u, u^2, 1] contains the exponents of all bumps, the roots of both
     leverages, the smooth parts of both corrections, and the trend. *Bends* are the smooth terms
     without u.
     """
@@ -83,7 +84,10 @@ class KernelTables:
     def correct(
         self, u: Sequence[float], tilts: Sequence[float]
     ) -> tuple[Vector, float, Vector, float, tuple[float, float]]:
-        """Return correction, rad, and leverage ratio of a and of b, then T_x and T_y, rad."""
+        """Return correction, rad, and leverage ratio of each expert, then the trend, rad.
+
+        The plain expert precedes the tilted expert. The trend has the components x and y.
+        """
         seen = [*u, *tilts]
         smooth = smooth_terms_one(seen)
         row = [*smooth, *[v * v for v in seen], 1.0]

@@ -5,8 +5,8 @@ r"""Linear trend of the soft-tissue artefact, used outside the training range.
 for the axes j = x, y, which are horizontal in the static pose. The terms are a constant, the
 disagreement d of each further sensor about the same axis, and the tilt v about the same axis. The
 term with d is equivalent to other weights of the sensors in the mean. About z, the long axis of the
-segment, a constant and a heading are indistinguishable, so there is no trend. The trend does not
-depend on headings.
+segment, a constant correction and a heading error are indistinguishable, so there is no trend. The
+trend does not depend on headings.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ LEVEL_AXES = (0, 1)
 
 
 def trend(rows: tuple[Row, Row], u: Array) -> Array:
-    """Return the trend of every frame, rad, (n, 3), with the limits of a correction."""
+    """Return the trend of every frame, rad, shape (n, 3), limited to ±`LARGEST`."""
     found = np.zeros((len(u), 3))
     table = np.array(rows)
     found[:, LEVEL_AXES] = table[:, 0] + u @ table[:, 1:].T

@@ -367,7 +367,7 @@ class LabelSearch:
         suspects: Sequence[int],
         label: int,
     ) -> int | None:
-        """Return the hidden marker at whose position a label is, or None if it is not unique.
+        """Return the hidden marker at whose position a label is; None if there is no single one.
 
         Only clusters that are not suspect are searched.
         """
@@ -425,7 +425,7 @@ def explain_trial(search: LabelSearch, positions: Array) -> tuple[LabelFault, ..
     names = [cluster.name for cluster in search.clusters]
     confirmed = []
     for fault, count in votes.items():
-        # Count the frames in which a cluster of the fault does not fit, or which it explains.
+        # Count the frames in which a cluster of the fault does not fit, or that the fault explains.
         parts = [names.index(part) for part in fault.parts]
         suspicious = sum(
             bool((finding.rms[parts] > MAX_FIT_RMS_M).any()) or fault in finding.faults
@@ -524,7 +524,7 @@ def _cost(rms: Array, count: Array) -> Array:
 def _combine(
     options: Sequence[Sequence[_Assignment]],
 ) -> Generator[None, None, list[tuple[int, ...]] | None]:
-    """Return the assignments with the least cost in which every label is used once.
+    """Return the assignments with the least cost in which no label is used twice.
 
     The result is None if no label is changed, or if the cost of another combination is almost as
     low.

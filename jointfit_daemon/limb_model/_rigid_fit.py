@@ -34,7 +34,7 @@ MAX_BRIDGE = 60
 """Largest number of successive frames with a missing marker that are interpolated."""
 
 MAX_FIT_RMS_M = 0.03
-"""RMS residual above which markers must be swapped or mislabeled, m, because soft tissue moves
+"""RMS residual, m, above which the markers are swapped or mislabeled, because soft tissue moves
 less.
 """
 

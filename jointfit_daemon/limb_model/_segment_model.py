@@ -107,7 +107,7 @@ class SegmentModel(ABC):
 
 
 def widen_sd(sd: float, movements: int) -> float:
-    """Return `sd`, which is increased if the training data contain few distinct movements."""
+    """Return `sd`, increased if the training data contain few distinct movements."""
     return sd if movements >= FEW_MOVEMENTS else sd * FEW_MOVEMENTS_FACTOR
 
 

@@ -57,8 +57,8 @@ class SensorLink:
     spread: float
     """RMS residual per component on held-out frames, rad."""
     total: float
-    """RMS per component of the predicted quantity, rad. It is the residual if the posture is
-    unknown.
+    """RMS per component of the predicted quantity, rad. If the posture is unknown, the standard
+    deviation is `total` plus `spread`.
     """
     uncertainty: tuple[tuple[float, ...], ...] = ()
     """Factor U of the covariance of the weights of a component, rad, shape (10, 10); empty without
@@ -71,7 +71,7 @@ class SensorLink:
         Parameters
         ----------
         up_a, up_near : Vector
-            Vertical in the frames of the two segments; None if unknown.
+            Vertical in the frames of the two segments; `up_near` is None if unknown.
         """
         if up_near is None:
             return (0.0,) * len(self.weights), self.total + self.spread

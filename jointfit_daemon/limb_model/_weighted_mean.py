@@ -30,7 +30,7 @@ def fuse(sensors: Sequence[Array], weights: Sequence[float]) -> Array:
     sensors : sequence of ndarray, shape (n, 4)
         One array for each sensor.
     weights : sequence of float
-        Positive weight of each sensor.
+        Non-negative weight of each sensor.
     """
     if len(sensors) == 1:
         return rotation.normalize(sensors[0])

@@ -127,7 +127,7 @@ class FrameLatency:
         self._fused.clear()  # states of the previous event that no output encoded
 
     def mark_fused(self, deadline_ns: int | None) -> None:
-        """Count the latency of the stages of a frame up to the fusion."""
+        """Count the latency of a frame up to the fusion, from its arrival or from `deadline_ns`."""
         found, fused_ns = self._histograms, self._clock()
         if deadline_ns is None:
             began_ns, decoded_ns = self._arrival_ns, self._decoded_ns

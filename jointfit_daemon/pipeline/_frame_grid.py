@@ -2,8 +2,8 @@
 
 Invariant: frames are due from the first configuration on, with or without samples, and their
 instants increase across reloads. A reload starts a new grid only if it changes rates, sensors or
-the alignment mode. In this case pending samples are counted, and the counts of remaining sensors
-continue.
+the alignment mode. In this case the pending samples are counted as dropped, and the counts of the
+remaining sensors continue.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 The monitor is used for rigs without a chain model. It compares the markers with the clusters of the
 current calibration. Markers with faulty labels are hidden from fusion until they fit the clusters
-again. Invariant: a fault is reported when it has explained the frames of 2 s. Its end is reported
+again. Invariant: a fault is reported when it has explained most frames of 2 s. Its end is reported
 after 2 s without this fault. Hidden markers neither begin nor end a fault.
 """
 
@@ -46,16 +46,16 @@ FAULT_NS = 2_000_000_000
 MISFIT_NS = 4_000_000_000
 """Time after which a cluster is reported if no exchange of labels explains its misfit, ns."""
 _FEWEST = 7
-"""Smallest number of frames with all clusters of a fault that permits a decision. They span more
-than half of `FAULT_NS`."""
+"""Smallest number of frames for a decision. All clusters of the fault are visible in these frames.
+At `RATE_HZ`, they span more than half of `FAULT_NS`."""
 _PRESENT = 0.6
 """Smallest share of frames that a fault must explain to begin. Markers may be hidden in the other
 frames."""
 _ABSENT = 0.1
-"""Share of frames that a fault explains, or that do not fit, below which a fault or misfit ends."""
+"""A fault or misfit ends if it occurs in at most this share of frames."""
 _REFUSED = 0.8
-"""Smallest share of the frames with a body part in which its markers must not fit, so that a misfit
-is reported."""
+"""A misfit of a body part is reported if its markers fail to fit in this share of the frames
+in which they are visible."""
 
 
 class _Examined(NamedTuple):
@@ -94,9 +94,10 @@ class LabelMonitor:
         self._hidden: NDArray[np.intp] = np.zeros(0, dtype=np.intp)
         """Columns of the mocap layout whose labels are faulty."""
         self.faults: dict[LabelFault, frozenset[str]] = {}
-        """Current faults. The markers of the listed body parts must be visible to end a fault."""
+        """Body parts of each current fault. Their markers must be visible before the fault can
+        end."""
         self.misfits: frozenset[str] = frozenset()
-        """Body parts whose markers do not fit, although no fault in `faults` explains this."""
+        """Body parts whose markers do not fit for a reason that no fault in `faults` explains."""
 
     def serves(self, chain: Chain, calibration: Calibration) -> bool:
         """Return whether a new monitor with these arguments would be equivalent to this monitor."""

@@ -50,7 +50,8 @@ class MovingCenters:
     .. math:: D^2 = \delta^T (C + C_{calibrated})^{-1} \delta \sim \chi^2_r,
 
     over the r directions that both movements observed. Residuals from soft-tissue artefact repeat
-    with posture. In both covariances, all frames together count as one observation of them.
+    with posture. In both covariances, all frames together count as one observation of these
+    residuals.
 
     Parameters
     ----------

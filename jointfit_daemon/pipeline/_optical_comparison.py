@@ -200,9 +200,10 @@ def _segments_at(t_ns: int, before: LimbState, after: LimbState) -> list[Quatern
 
 
 def _position_at(t_ns: int, joint: int, pair: tuple[LimbState, LimbState] | None) -> Vector | None:
-    """Return a joint position interpolated between two states; None without the cameras' origin.
+    """Return a joint position interpolated between two states; None if it cannot be compared.
 
-    The cameras define the position of the first joint, so it is not compared.
+    The comparison needs the origin from the cameras in both states. The cameras define the position
+    of the first joint, so this joint is not compared.
     """
     if pair is None or joint == 0:
         return None

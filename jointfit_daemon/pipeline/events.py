@@ -74,7 +74,7 @@ class ChunkArrived:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """Time passed without other events: a deadline of the core, or the longest interval."""
+    """No other event arrived before a deadline of the core, or within the longest interval."""
 
     t_ns: int
 
@@ -122,7 +122,7 @@ class CalibrationSelected:
     version: int
     """Version of the loaded calibration."""
     age_s: float
-    """Time since the static pose of the calibration, s. The heading uncertainty grows with this
+    """Time since the calibration was stored, s. The heading uncertainty grows with this
     time."""
     request: Request
 
@@ -275,7 +275,7 @@ class CalibrationStatus:
     version: int | None = None
     """Version of the current calibration; None if there is none, or if it is not stored."""
     quality: Mapping[str, object] = field(default_factory=dict)
-    """Quality of the result of the last phase; otherwise of the current calibration."""
+    """Quality of the result of the last phase; without a result, of the current calibration."""
     kept: str | None = None
     """Reason why a new result was rejected, so that the current calibration stays in use."""
     refused: Mapping[str, object] = field(default_factory=dict)

@@ -53,11 +53,12 @@ def calibrate_recording(
     Parameters
     ----------
     path
-        Path of the recording; any part of a session in several parts.
+        Path of the recording. For a session in several parts, the path of any part.
     rig
         Rig that replaces the recorded rig, for example with other markers or another method.
     report
-        Function that is called with the time since the beginning, s, and every calibration status.
+        Function that is called with every calibration status. The first argument is the time since
+        the beginning of the recording, s.
 
     Raises
     ------

@@ -38,7 +38,7 @@ def load_session(
     Parameters
     ----------
     path
-        Path of the recording; any part of a session in several parts.
+        Path of the recording. For a session in several parts, the path of any part.
     rig
         Rig that replaces the recorded rig. If it is given, fits are computed again.
     calibration

@@ -1,7 +1,7 @@
 """Collection of the measurements and outputs of a core as arrays of a session.
 
 All series share the time axis of the cameras. For this purpose, the lag of each sensor is
-subtracted from its stamps. The lags come from the calibration in use at the end of the session.
+subtracted from its timestamps. The lags come from the calibration in use at the end of the session.
 Rows that are not later than the previous row are omitted, because a clock that settles or restarts
 may step back.
 """

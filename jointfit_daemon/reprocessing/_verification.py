@@ -165,7 +165,7 @@ def verify_recording(path: Path) -> Verification:
     Parameters
     ----------
     path
-        Path of the recording; any part of a session in several parts.
+        Path of the recording. For a session in several parts, the path of any part.
 
     Raises
     ------

@@ -141,7 +141,7 @@ class SeriesQuality:
 
     count: int
     rate_hz: float
-    """Rate, Hz, the inverse of the median interval; NaN for less than two rows."""
+    """Rate, Hz, the inverse of the median interval; NaN for fewer than two rows."""
     lost_share: float
     """Missing samples as a fraction of the samples expected between the first and the last row."""
     gaps_s: Array

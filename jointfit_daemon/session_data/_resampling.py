@@ -33,7 +33,7 @@ without interpolation.
 def sample_rate_hz(t_s: Array) -> float:
     """Return the rate, Hz, of instants, s, shape (n,), which is the inverse of the median interval.
 
-    The result is NaN for less than two instants.
+    The result is NaN for fewer than two instants.
     """
     return 1.0 / float(np.median(np.diff(t_s))) if len(t_s) > 1 else float("nan")
 
@@ -74,7 +74,7 @@ def uniform_times(axes: Sequence[Array]) -> Array:
 
 
 def _period(t_s: Array) -> float:
-    """Return the period of a series with missing rows, s; infinity for less than two rows."""
+    """Return the period of a series with missing rows, s; infinity for fewer than two rows."""
     if len(t_s) < 2:  # noqa: PLR2004 - an interval has two ends
         return float("inf")
     steps = np.diff(t_s)
@@ -104,7 +104,10 @@ def rows_on_axis(t_s: Array, axis_s: Array) -> NDArray[np.intp] | None:
 
 
 def interpolate_values(t_s: Array, values: Array, at_s: Array) -> Array:
-    """Interpolate linearly from shape (n, ...) to (m, ...), with NaN outside and inside gaps."""
+    """Interpolate linearly from shape (n, ...) to (m, ...).
+
+    The result is NaN at instants outside the series or in a gap.
+    """
     i, j, share = _neighbours(t_s, at_s)
     if not len(t_s):
         return np.full((len(at_s), *values.shape[1:]), np.nan)

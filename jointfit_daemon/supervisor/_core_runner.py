@@ -28,7 +28,7 @@ event loop."""
 
 
 class CoreInterface(Protocol):
-    """Interface of the core, with the methods that the shell uses."""
+    """Interface of the core, with the methods that the supervisor uses."""
 
     stages: StageObserver | None
     """Observer of the processing stages of every frame; None without observer."""

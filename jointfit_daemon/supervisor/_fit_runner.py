@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 FIT_TIMEOUT_S = 300.0
-"""Longest duration of a fit, s. Later the subject has probably removed the sensors."""
+"""Longest duration of a fit, s. After this time the subject has probably removed the sensors."""
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 """Environment variables of the worker, which numpy reads on import. More threads would use the CPU
 core that processes the sensors. They are also slower on small matrices: 11 s instead of 1 s."""
@@ -101,8 +101,8 @@ async def _in_worker(job: FitJob, report: Callable[[dict[str, Any]], None]) -> d
         async with asyncio.TaskGroup() as pipes:
             answer = pipes.create_task(_answer(worker.stdout, report), name="fit result")
             printed = pipes.create_task(_read(worker.stderr), name="fit output")
-            # The pipe must stay open, because the worker exits when it is closed. A worker that
-            # ended early causes a missing answer, which is reported.
+            # The pipe must stay open, because the worker exits when the pipe is closed. If the
+            # worker ended early, the missing result is reported below.
             with contextlib.suppress(BrokenPipeError, ConnectionResetError):
                 if worker.stdin is not None:
                     worker.stdin.write(HEADER.pack(len(data)) + data)
@@ -123,7 +123,7 @@ async def _in_worker(job: FitJob, report: Callable[[dict[str, Any]], None]) -> d
 async def _answer(
     pipe: asyncio.StreamReader | None, report: Callable[[dict[str, Any]], None]
 ) -> dict[str, Any]:
-    """Report each line of the worker except the last as progress; return the last; {} if none."""
+    """Report the progress lines of the worker; return its result line, or {} if there is none."""
     found: dict[str, Any] = {}
     while pipe is not None and (line := await pipe.readline()):
         content = orjson.loads(line)

@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 
 class Report(Protocol):
-    """Interface of the function that reports a state of the shell."""
+    """Interface of the function that reports a state of the daemon."""
 
     def __call__(self, kind: NoticeKind, text: str, level: NoticeLevel) -> None:
         """Publish and log the state."""

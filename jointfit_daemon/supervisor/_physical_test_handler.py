@@ -141,7 +141,7 @@ class PhysicalTestHandler:
         if action == "start":
             if (phase := self._daemon.health().core.phase) in RUNNING_PHASES:
                 text = (
-                    f"calibration phase {phase} is running and would lose {name}: wait for its end"
+                    f"calibration phase {phase} is running and would lose {name}: wait for the end"
                 )
                 return request.refusal("physical-test.action", text)
             await self._start(sensors[name])
@@ -159,7 +159,7 @@ class PhysicalTestHandler:
         return request.reply("ok", await running.state())
 
     async def _start(self, source: Source) -> None:
-        """Reopen the sensor, so that the test receives its replies to the driver."""
+        """Reopen the sensor, so that the test receives the sensor's replies to the driver."""
         self._stop()
         await self._daemon.restart_device(source.id)
         self._stop()  # another request may have started a test during the restart

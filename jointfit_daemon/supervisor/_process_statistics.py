@@ -21,7 +21,7 @@ _DELAYS = 600
 
 
 class ProcessStatistics:
-    """Statistics of this process since the previous call of `health`."""
+    """Statistics of this process, some of them since the previous call of `health`."""
 
     def __init__(self) -> None:
         self._wall_s, self._cpu_s = time.monotonic(), time.process_time()
@@ -32,7 +32,7 @@ class ProcessStatistics:
         self._delays_s.append(seconds)
 
     def health(self) -> ProcessHealth:
-        """Return CPU share, memory and event loop delay since the last call."""
+        """Return CPU share since the last call, memory, and loop delay of the last minute."""
         wall_s, cpu_s = time.monotonic(), time.process_time()
         share = (cpu_s - self._cpu_s) / max(1e-9, wall_s - self._wall_s)
         self._wall_s, self._cpu_s = wall_s, cpu_s

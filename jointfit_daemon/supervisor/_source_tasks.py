@@ -145,7 +145,7 @@ async def run_source(
         device, misconfigured, absent = _device_identity(path), False, False
         try:
             await driver.run(reporter.emit)
-            text = "its driver ended by itself: report it to its author; retrying"
+            text = "its driver ended by itself: report this to the author of the driver; retrying"
         except DeviceLostError as lost:
             absent, text = isinstance(lost, DeviceAbsentError), str(lost)
         except DeviceMisconfiguredError as wrong:

@@ -276,7 +276,7 @@ class Daemon:
         self._topics.publish_log_line(level, name, text, suppressed)
 
     def _report(self, kind: NoticeKind, text: str, level: NoticeLevel = NoticeLevel.INFO) -> None:
-        """Report a state of the shell, in the log and on ``bridge/event``."""
+        """Report a state of the daemon, in the log and on ``bridge/event``."""
         log.log(LEVELS[level], "%s: %s", kind, text, extra=journal_fields(kind, self._rig.name))
         notice = Notice(time.monotonic_ns(), kind, self._rig.name, text, level)
         self._topics.publish_notice(notice)

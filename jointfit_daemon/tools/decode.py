@@ -92,7 +92,7 @@ class CaptureSummary:
 
 
 _MOST_DISCARDED = 0.9
-"""Share of discarded bytes above which a capture without orientations is of another device."""
+"""Share of discarded bytes above which a capture without orientations belongs to another device."""
 
 
 def decode(

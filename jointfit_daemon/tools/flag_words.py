@@ -10,11 +10,13 @@ _FLAGS = {
     "uncalibrated": "Not calibrated: angles are unknown.",
     "other_chain": "The stored calibration belongs to another limb: calibrate again.",
     "headings_from_static": "Headings come from the static pose: there was no align phase.",
-    "same_pose_assumed": "The static pose was recorded without cameras: the last one is assumed.",
+    "same_pose_assumed": "The static pose was recorded without cameras; the same pose as before is"
+    " assumed.",
     "stuck": "% repeats its value and is not used.",
     "slipped": "% moved on the body and is not used.",
     "pair_disagrees": "The two sensors of % contradict each other: check their straps.",
-    "heading_disagrees": "Magnetic disturbance at the %: angles are corrected, headings uncertain.",
+    "heading_disagrees": "Magnetic disturbance at the %: angles are corrected, headings are"
+    " uncertain.",
     "heading_unseen": "The limb may have turned about the vertical; joint angles are not affected.",
     "one_sensor": "Only one sensor of % contributes.",
     "held": "No data from the sensors of %: the last orientation is held.",

@@ -44,7 +44,7 @@ def check_output(option: str, path: Path | None, endings: Sequence[str]) -> None
         raise ValueError(f"{option} {path}: found a folder, expected a file: add a file name")
     if not os.access(path if path.exists() else folder, os.W_OK):
         raise ValueError(
-            f"{option} {path}: no write permission: change it or choose another folder"
+            f"{option} {path}: no write permission: change the permission, or choose another folder"
         )
 
 

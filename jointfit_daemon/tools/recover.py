@@ -25,8 +25,8 @@ def recover(
 ) -> None:
     """Copy the readable messages of a damaged recording to a clean file, and list what is missing.
 
-    All commands read damaged recordings without it; other programs need a clean file. The source is
-    not changed. Exit codes: 0 copied; 1 the file cannot be read or written; 2 it is not a
+    The commands of jointfit also read damaged recordings; other programs need a clean file. The
+    source is not changed. Exit codes: 0 copied; 1 the file cannot be read or written; 2 it is not a
     recording.
     """
     from jointfit_daemon.outputs.recording import repair_recording
@@ -60,7 +60,7 @@ def recover(
     for gap in result.gaps:
         typer.echo(gap.text())
     if not result.closed:
-        typer.echo("the recording was not closed: up to its last second may be missing")
+        typer.echo("the recording was not closed: messages of its last second may be missing")
     if result.unreadable_bytes:
         typer.echo(f"{result.unreadable_bytes} bytes are damaged or incomplete")
     elif not result.gaps and result.closed:

@@ -63,6 +63,8 @@ ORIGIN_NS = 100_000_000
 """Unit of the start time, ns. The samples of perfect clocks then coincide with the ground truth."""
 _COMMAND_BYTES = 4096
 """Maximum length of a command line, bytes."""
+_PERFECT = "all imperfections zero, except clock offsets, minimum latencies, and those in --set"
+"""Help text of ``--perfect``."""
 COMMANDS = """commands, one per line on standard input:
   play NAME                   change to another motion
   unplug ID, plug ID          disconnect or connect a sensor, or the bus adapter (can0)
@@ -111,17 +113,19 @@ def _parser() -> argparse.ArgumentParser:
 def _add_play_options(play: argparse.ArgumentParser) -> None:
     play.add_argument("--directory", type=Path, required=True, help="output folder")
     play.add_argument("--limb", choices=[*LIMBS], default="leg",
-                      help="leg: thigh and shank; arm: thorax to hand; trunk: thorax and pelvis "
-                      "(default leg)")  # fmt: skip
-    play.add_argument("--programme", help="NAME:SECONDS,…; the last one continues (default stand)")
+                      help="leg: thigh and shank; legs: both legs with the pelvis; "
+                      "arm: thorax to hand; trunk: thorax and pelvis (default leg)")  # fmt: skip
+    play.add_argument(
+        "--programme", help="NAME:SECONDS,…; the last motion continues (default stand)"
+    )
     play.add_argument("--set", dest="settings", action="append", default=[], metavar="KNOB=VALUE")
     play.add_argument("--knobs", type=Path, help="TOML file of knobs")
-    play.add_argument("--perfect", action="store_true", help="no errors except those of --set")
+    play.add_argument("--perfect", action="store_true", help=_PERFECT)
     play.add_argument("--rate", type=float, help="IMU samples per second")
     play.add_argument("--seed", type=int, help="random seed")
     play.add_argument("--command-port", type=int, metavar="PORT",
-                      help="UDP port of the motion-capture server (default: that of the previous "
-                      "run in this directory, otherwise any free port)")  # fmt: skip
+                      help="UDP port of the motion-capture server (default: the port of the "
+                      "previous run in this directory, otherwise any free port)")  # fmt: skip
     play.add_argument("--follow", action="store_true",
                       help="select the motion by the daemon's calibration phase: align, static, "
                       "functional (over MQTT, broker and base as in rig.toml)")  # fmt: skip
@@ -147,9 +151,9 @@ def _add_play_options(play: argparse.ArgumentParser) -> None:
                       help="replay a trial: .npz or .sto, with .trc and .json")  # fmt: skip
 
     play.add_argument("--recording", type=Path, metavar="FILE",
-                      help="send a recording of the daemon by virtual devices, once, at its "
-                      "intervals, and write its rig.toml for them; all other options except "
-                      "--mqtt-host and --mqtt-port have no effect")  # fmt: skip
+                      help="send a recording of the daemon once by virtual devices, at the "
+                      "recorded intervals, and write a rig.toml for these devices; all other "
+                      "options except --mqtt-host and --mqtt-port have no effect")  # fmt: skip
 
     for field in dataclasses.fields(RigOptions):
         play.add_argument(
@@ -162,7 +166,7 @@ def _add_play_options(play: argparse.ArgumentParser) -> None:
 
 def _add_hardware_options(play: argparse.ArgumentParser) -> None:
     play.add_argument("--imu", action="append", default=[], metavar="ID=DRIVER",
-                      help="driver of the IMU that a sensor simulates, such as S2=xbus; by default "
+                      help="driver of the IMU simulated for a sensor, such as S2=xbus; by default "
                       "xbus and xcdi in turn; xbus-mtdata is an older device of xbus")  # fmt: skip
     play.add_argument("--mocap", default="natnet", metavar="DRIVER",
                       help="driver of the motion-capture server (default natnet)")  # fmt: skip
@@ -175,7 +179,7 @@ def _knobs(options: argparse.Namespace) -> Knobs:
     if options.perfect:
         knobs = perfect(knobs)
     if options.rate is not None and not 0.0 < options.rate < math.inf:
-        raise ValueError(f"--rate {options.rate:g}: expected samples a second above 0")
+        raise ValueError(f"--rate {options.rate:g}: expected a number above 0, Hz")
     named = {"rate_hz": options.rate, "seed": options.seed}
     settings = [f"{name}={value}" for name, value in named.items() if value is not None]
     return apply_settings(knobs, settings + options.settings)

@@ -51,7 +51,7 @@ class ContractDevice(Protocol):
 
 
 def orientation(number: int) -> Quaternion:
-    """Return the orientation of sample `number`; it differs by 0.1 rad from its neighbours."""
+    """Return the orientation of sample `number`; it differs by 0.13 rad from its neighbours."""
     turn, tilt = 0.06 * number, 0.025 * number
     return (
         math.cos(turn) * math.cos(tilt),

@@ -23,12 +23,12 @@ then collects all tests of the suite::
             return WrongDevice(folder / "imu")
 
 `folder` is an empty directory for each test. A device needs the methods ``push``, ``run``,
-``unplug`` and ``plug``; a class that overrides ``send`` needs no ``push``. The attribute
-``rate_hz`` of a device, if it exists, is the rate of its samples. If the driver yields another type
-than ``ImuSample``, override ``measurement``, ``send`` and ``matches``. Line speed and time limits
-are class attributes. Some features are optional: ``make_wrong_device`` may return ``None``,
-``baud`` may be None, and ``has_noise`` and ``has_plug`` may be False. The corresponding tests are
-then skipped with a reason.
+``unplug`` and ``plug``; if the class overrides ``send``, the device needs no ``push``. The
+attribute ``rate_hz`` of a device, if it exists, is the rate of its samples. If the driver yields
+another type than ``ImuSample``, override ``measurement``, ``send`` and ``matches``. Line speed and
+time limits are class attributes. Some features are optional: ``make_wrong_device`` may return
+``None``, ``baud`` may be None, and ``has_noise`` and ``has_plug`` may be False. The corresponding
+tests are then skipped with a reason.
 """
 
 from __future__ import annotations
@@ -95,7 +95,8 @@ class DriverContract(ABC):
     rate_hz: ClassVar[float] = 100.0
     """Sample rate in device time, Hz, for a device without ``rate_hz``."""
     pace_s: ClassVar[float] = 0.002
-    """Host time between two samples, s. It is shorter than the device time to shorten the suite."""
+    """Host time between two samples, s. It is shorter than their interval in device time, so that
+    the tests end sooner."""
     baud: ClassVar[int | None] = 115_200
     """Line speed in the driver's settings, bit/s; None if transmission takes no time (USB, TCP)."""
     has_noise: ClassVar[bool] = True
@@ -282,8 +283,8 @@ class DriverContract(ABC):
             again.emit(Chunk(t_ns + _PAUSE_NS, data[-_INCOMPLETE:]))
             require(
                 len(again.measurements) == len(whole),
-                f"a pause of {_PAUSE_NS // 1_000_000} ms inside a message is a busy host and must "
-                "not discard the message",
+                f"a pause of {_PAUSE_NS // 1_000_000} ms inside a message shows a busy host and "
+                "must not discard the message",
             )
 
             again = DecodingReceiver(driver, self.measurement)

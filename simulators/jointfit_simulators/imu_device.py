@@ -49,8 +49,8 @@ class ImuDevice(Protocol):
 
         Notes
         -----
-        A device that does not stream counts the sample but sends nothing. If the wire is full (no
-        reader), the whole sample is lost and not counted as sent.
+        A device that does not stream sends nothing. If the wire is full (no reader), the whole
+        sample is lost and not counted as sent.
         """
 
     async def run(self) -> None:

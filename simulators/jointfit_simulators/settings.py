@@ -76,8 +76,8 @@ class Knobs:
     latency_uart_ms: float = 2.0
     latency_can_ms: float = 1.0
     latency_mocap_ms: float = 6.0
-    """Minimum delay from sampling to transmission by the cameras. The settings for UART and CAN
-    have the same meaning."""
+    """Minimum delay of the cameras from sampling to transmission. `latency_uart_ms` and
+    `latency_can_ms` are the corresponding delays of IMUs."""
     latency_jitter_ms: float = 0.5
     """Mean of the exponentially distributed delay in addition to the minimum."""
     dropout: float = 0.005
@@ -128,7 +128,7 @@ _IMPERFECT = (
 
 
 def perfect(knobs: Knobs) -> Knobs:
-    """Return `knobs` with all errors set to zero."""
+    """Return `knobs` with all errors zero, except clock offsets and minimum latencies."""
     nothing: dict[str, Any] = dict.fromkeys(_IMPERFECT, 0.0)
     return dataclasses.replace(knobs, **nothing)
 
@@ -157,6 +157,6 @@ def apply_settings(knobs: Knobs, settings: Iterable[str]) -> Knobs:
 
 
 def knobs_from_toml(path: Path) -> Knobs:
-    """Return the settings in a TOML file with ``name = value`` lines; others have defaults."""
+    """Return the settings in a TOML file with ``name = value`` lines; the rest have defaults."""
     table = read_toml(path)
     return apply_settings(Knobs(), [f"{name}={value}" for name, value in table.items()])

@@ -73,8 +73,8 @@ def fit_center(points: Array, start: Array) -> CenterEstimate:
     Returns
     -------
     CenterEstimate
-        Center with `leverage`. `refused` is set if there are too few frames, no arc, or an
-        implausible radius.
+        Center with `leverage`. `refused` is set if there are too few frames, the arc is too short,
+        the radius is implausible, or the standard deviation is too large.
     """
     points = points[:: max(1, -(-len(points) // MAX_FRAMES))]
     seen = visible(points)
@@ -101,10 +101,13 @@ def _objection(found: CenterEstimate) -> str | None:
 
 
 def too_uncertain(found: CenterEstimate) -> str | None:
-    """Return the reason why a center has too large an error, with the remedy."""
+    """Return reason and remedy if the error of a center is too large; None otherwise."""
     sd = float(np.sqrt(np.linalg.norm(found.covariance, 2)))
     if sd > MAX_SD_M:
-        return f"uncertain to {1000 * sd:.0f} mm: move this joint further, and in other directions"
+        return (
+            f"the predicted error is {1000 * sd:.0f} mm: move this joint further, and in other "
+            "directions"
+        )
     return None
 
 

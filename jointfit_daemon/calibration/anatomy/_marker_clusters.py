@@ -229,7 +229,7 @@ def moving_template(positions: Array) -> Array:
     """Return marker positions on a rigid body, m, (k, 3), from a recorded movement (m, k, 3).
 
     The first frame with all markers is the initial template. All frames are aligned with the
-    template, and their average is the next template. Both steps are done twice (generalized
+    template, and their median is the next template. Both steps are done twice (as in generalized
     Procrustes analysis). The centroid of the result is zero.
 
     Raises

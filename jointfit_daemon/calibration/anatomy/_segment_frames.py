@@ -80,8 +80,9 @@ class JointCenter:
     covariance: Array
     """Covariance of the position, m², shape (3, 3)."""
     source: str
-    """Source of the center: ``fit`` (movement), ``length`` (other end of a segment and its
-    configured length) or ``midpoint`` (middle between the two distal joints of a branched segment).
+    """Source of the center. ``fit`` is an estimate from the movement. ``length`` is computed from
+    the other end of a segment and its configured length. ``midpoint`` is the middle between the two
+    distal joints of a branched segment.
     """
     fit: CenterEstimate | None
     """Center of rotation from the movement; None if `source` is not ``fit``."""
@@ -275,7 +276,7 @@ def place_unobserved(
 ) -> dict[str, CenterEstimate]:
     """Move centers along unobserved directions until they are above or below their neighbors.
 
-    The leg is straight in the static pose, so neighboring joints are vertically above each other.
+    The limb is straight in the static pose, so neighboring joints are vertically above each other.
     Centers next to fully observed centers are moved first.
     """
     whole = [joint for joint, fit in found.items() if len(fit.unseen) == 0]

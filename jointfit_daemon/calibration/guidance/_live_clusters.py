@@ -38,7 +38,7 @@ class ClusterVisibility(NamedTuple):
     suspect: str | None
     """Marker that was most often the most deviating marker of a misfit."""
     absent: tuple[str, ...]
-    """Markers (or the rigid body) that are not in the stream."""
+    """Markers (or the rigid body) that the stream has not contained so far."""
 
 
 class LiveClusters:

@@ -47,8 +47,8 @@ if TYPE_CHECKING:
 _ROUNDED_M2 = 1e-12
 """Lower bound of squared radii, m², which prevents a division by zero."""
 _ALONG = 0.7
-"""Cosine limit. A direction at a smaller angle to an unobserved direction of the estimator also
-counts as unobserved.
+"""Cosine of the angle to an unobserved direction of the estimator. A direction with a larger
+absolute cosine also counts as unobserved.
 """
 
 
@@ -65,12 +65,12 @@ class LiveJointCenter:
     observed.
     """
     noise_across: float
-    """Random error without the least certain direction, m. The movement of a hinge determines only
-    the other directions.
+    """Random error in the two most certain directions, m. The movement of a hinge determines only
+    these directions.
     """
     total: float
     """Total error, m, as standard deviation per axis, including soft-tissue artefact. In unobserved
-    directions it is the error of the prior of the static pose. A calibration stores this value.
+    directions, the error follows from the static pose. A calibration stores this value.
     """
     arc: float
     """Range of the marker directions about the center, rad."""
@@ -79,7 +79,7 @@ class LiveJointCenter:
     center is rejected.
     """
     frames: int
-    """Number of frames with both body parts."""
+    """Number of frames with the pose of the proximal body part and a marker of the distal one."""
     unseen: int
     """Number of unobserved directions, 0 to 3."""
     refused: str | None
@@ -173,8 +173,8 @@ class LiveJointCenters:
     def estimate_centers(self) -> dict[str, LiveJointCenter]:
         """Return the current estimates; call a few times per second, not in every frame.
 
-        An estimate takes a thousand times as long as `feed`, so each call updates only one joint in
-        turn.
+        An estimate takes a thousand times as long as `feed`. Each call therefore fits only one
+        joint, and successive calls fit the joints in turn.
         """
         if self.joints:
             self.estimate_next()

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import MocapFrame, MocapLayout
 
 _INTERVAL = 24
-"""Interval between two examined frames, frames. The search takes milliseconds and is divided among
-the frames that follow.
+"""Number of frames from one examined frame to the next. The search takes milliseconds and is
+divided among the frames that follow.
 """
 _RECENT = 12
 """Number of examined frames on which a decision is based: 2 to 3 s at 100 to 120 Hz."""

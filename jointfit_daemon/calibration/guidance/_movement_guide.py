@@ -55,7 +55,9 @@ MIN_BENDS = 12
 squats contains this number.
 """
 MIN_SEEN = 0.5
-"""Smallest fraction of frames with a body part. With fewer frames the fit would be rejected."""
+"""Smallest fraction of the frames in which a body part is visible. With fewer frames the fit would
+be rejected.
+"""
 MAX_MISFITS = 0.1
 """Fraction of frames with displaced markers above which the operator is informed."""
 PATIENCE_S = 2.0

@@ -69,7 +69,9 @@ _DISTINCT = cos(radians(20.0))
 """Cosine of the smallest angle between two poses."""
 _PLANES = {"x and y": (0, 1), "x and z": (0, 2), "y and z": (1, 2)}
 _TILTED = 0.4
-"""Smallest component of gravity along both axes of a tilted pose, as a fraction of gravity."""
+"""Smallest component of gravity along each of the two axes of a tilted pose, as a fraction of
+gravity.
+"""
 _SATURATED = 0.5 * STANDARD_GRAVITY
 """Specific force, m/s^2, that every accelerometer measures without saturation."""
 

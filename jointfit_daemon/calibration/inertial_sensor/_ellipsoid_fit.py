@@ -5,7 +5,7 @@ A sensor with bias b and a symmetric matrix M of scale factors and non-orthogona
 .. math:: |M (v - b)| = r
 
 M can be chosen symmetric, because a rotation of all three axes does not change magnitudes. The
-parameters minimise the sum of squares of the magnitudes minus r.
+parameters minimize the sum of the squared differences between the magnitudes and r.
 
 Sources: Frosio, Pedersini and Borghese 2009, IEEE Trans. Instrum. Meas. 58, 2034-2041, equations
 5 to 9 (accelerometers); Gebre-Egziabher et al. 2006, J. Aerospace Eng. 19, 87-102 (magnetometers).

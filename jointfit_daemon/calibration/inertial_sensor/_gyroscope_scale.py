@@ -37,7 +37,8 @@ FEWEST_TURNS = 6
 LARGEST_SCALE_SD = 0.005
 """Largest standard deviation of a scale factor."""
 LARGEST_AXES_SD = 0.003
-"""Largest standard deviation, rad, of the off-diagonal elements with which these elements are used.
+"""Largest standard deviation of any element of the matrix, rad, with which the off-diagonal
+elements are used.
 """
 LARGEST_RESIDUAL = radians(1.5)
 """Largest RMS of the differences between the directions of gravity, rad."""

@@ -285,7 +285,8 @@ class MagnetometerStep:
         Raises
         ------
         SensorCalibrationError
-            No readings, too few directions, saturated readings, or a disturbed field.
+            There are no readings or too few directions, readings are saturated, or the field is
+            disturbed.
         """
         if not self._received:
             raise SensorCalibrationError(

@@ -24,13 +24,14 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 _ZERO = 1e-6
-"""Eigenvalue of S/T below which the eigenvalue is attributed to rounding. The unit is squared
-metres per squared metre. A marker that is independent of all others has the eigenvalue 1.
+"""Limit of an eigenvalue of S divided by the number of frames T. A smaller eigenvalue is attributed
+to rounding. The unit is squared metres per squared metre. A marker that is independent of all
+others has the eigenvalue 1.
 """
 _WEAK = 0.01
 """Eigenvalue below which a displacement of 10 mm increases the error by less than 1 mm."""
 _NAMED = 0.1
-"""Smallest share of a marker in the squared free directions with which the marker is listed."""
+"""Smallest sum of the squared components of a listed marker in the free directions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,13 +43,15 @@ class Gauge:
     fully observed marker are 1.
     """
     free: int
-    """Number of zero eigenvalues, which are displacements without effect on the tracking error."""
+    """Number of zero eigenvalues. Their eigenvectors are displacements without effect on the
+    tracking error.
+    """
     weak: int
     """Number of non-zero eigenvalues below 0.01."""
     involved: tuple[str, ...]
     """Markers that move along the free directions, in order of decreasing displacement."""
     fixed_by: str
-    """Constraint that determines the free directions: "locks", "prior" or "nothing"."""
+    """Constraint of the free directions: "prior" or "nothing"; "locks" if no direction is free."""
 
 
 def gauge_of(S: Array, frames: int, coordinates: Sequence[str], *, prior: float) -> Gauge:

@@ -179,7 +179,7 @@ def _gaps(model: ChainModel, trials: Sequence[MotionTrial]) -> list[str]:
     partly = np.any(present, axis=0) & ~np.all(present, axis=0)
 
     return [
-        f"{trial.name}: {', '.join(missing)} missing throughout"
+        f"{trial.name}: {', '.join(missing)} missing in every frame"
         for trial, there in zip(trials, present, strict=True)
         if (
             missing := [

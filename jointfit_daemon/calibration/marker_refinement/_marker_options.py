@@ -61,7 +61,7 @@ def with_locks(chain: ChainModel, texts: Iterable[str], option: str, *, locked: 
     Raises
     ------
     ValueError
-        Unknown marker.
+        A marker is unknown.
     """
     locks = {m.name: list(m.locked) for m in chain.markers}
     for text in texts:

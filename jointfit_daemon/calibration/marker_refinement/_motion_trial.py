@@ -62,8 +62,8 @@ class RefinementSettings:
     """Largest number of frames of a trial. Longer trials are decimated, so that no trial dominates.
     """
     evenness: float = 0.0
-    """Exponent of a trial's error in its weight. A larger exponent makes the errors of trials more
-    equal.
+    """Exponent p. The weight of a trial with the error e is proportional to e to the power p. A
+    larger exponent makes the errors of trials more equal.
     """
     limit_m2: float = 1.0
     """Weight of the squared excess of hinge angles over their limits, m^2/rad^2. It has no effect

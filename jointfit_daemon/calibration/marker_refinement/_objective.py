@@ -98,7 +98,7 @@ class RefinementProblem:
         return self.weights * (self.huber_m / beyond)
 
     def cost(self, distances: Array, positions: Array) -> float:
-        """Return F from the distances |e|, m, shape (T, M)."""
+        """Return F without its last term, from the distances |e|, m, shape (T, M)."""
         loss = 0.5 * distances**2
         if self.huber_m is not None:
             c = self.huber_m

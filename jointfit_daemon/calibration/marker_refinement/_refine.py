@@ -147,7 +147,7 @@ class _RefinementTask:
     """Poses of the training frames at the nominal positions."""
     holdout: _HoldOut | None
     restarted: int
-    """Number of training frames with poses that a restart from another pose improved."""
+    """Number of training frames whose poses a restart from another pose improved."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -90,7 +90,10 @@ class Refinement:
     """Findings about the input that do not prevent the refinement."""
 
     def variance_of_trials(self, *, trained: bool) -> tuple[float, float]:
-        """Return the variance of the trials' RMS errors before and after, m²; NaN for one trial."""
+        """Return the variance of the RMS errors of the trials before and after, m².
+
+        The result is NaN for fewer than two trials.
+        """
         some = [t for t in self.trials if t.trained == trained]
         return _variance([t.before.rms for t in some]), _variance([t.after.rms for t in some])
 

@@ -10,9 +10,10 @@ frame. With errors in segment axes and :math:`J_{tm} = \partial e/\partial q`,
     \delta p = -S^{-1} (h - \sum_t B_t^T A_t^{-1} g_t), \quad
     \delta q_t = -A_t^{-1} (g_t + B_t\, \delta p)
 
-where the weights are included. A step is accepted only if F decreases. Source: the elimination is
-the variable projection of Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973), 413, in the form that
-is used in bundle adjustment.
+where p are the marker positions, q the poses, g and h the gradients of F with respect to q and p,
+and C is the marker block of the normal matrix. All terms include the weights. A step is accepted
+only if F decreases. Source: the elimination is the variable projection of Golub and Pereyra, SIAM
+J. Numer. Anal. 10 (1973), 413, in the form that is used in bundle adjustment.
 """
 
 from __future__ import annotations

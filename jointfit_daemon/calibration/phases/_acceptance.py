@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 SLACK = 1.15
 """Largest ratio of the hold-out errors of two calibrations that count as equally good."""
 SLACK_RAD = np.deg2rad(0.3)
-"""Absolute difference of hold-out errors that is accepted, rad."""
+"""Increase of a hold-out error that is accepted in addition to `SLACK`, rad."""
 SLACK_M = 0.005
 """Difference of joint-center gaps that is accepted, m."""
 
@@ -33,7 +33,8 @@ def compare_calibrations(new: Calibration, old: Calibration | None) -> Calibrati
     this order, the chain, the use of cameras, the alignment of the worlds, and all errors together.
     An error is the hold-out error of a segment or of the flexion of an inner joint, or the gap
     between the two centers of a joint, which are fixed in its two body parts. A hold-out error may
-    be larger by the factor 1.15 plus 0.3°, and a gap by 5 mm.
+    be larger by the factor 1.15 plus 0.3°, and a gap by 5 mm. A center that was estimated from the
+    movement must not be replaced by a center from another source.
     """
     if old is None:
         return CalibrationComparison(True, "no calibration was in force")

@@ -1,7 +1,7 @@
 """Fits that the worker process runs, with one function for each class of job.
 
-A rejected calibration (`CalibrationError`) is a result with ``refused``. Any other exception is a
-bug.
+If a fit raises `CalibrationError`, the result contains the text of the error in ``refused``. Any
+other exception is a bug.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def _previous(job: StaticJob | FunctionalJob | RefitJob) -> Calibration | None:
 
 
 def _alignment(job: StaticJob | FunctionalJob) -> PlateAlignment | None:
-    """Return the alignment of this session, or else of the current calibration, or else None."""
+    """Return the alignment of this session, otherwise that of the current calibration, or None."""
     if job.alignment is not None:
         return PlateAlignment.from_dict(job.alignment)
     previous = _previous(job)

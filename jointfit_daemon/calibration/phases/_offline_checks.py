@@ -86,8 +86,8 @@ def _far_sensors(
 
             yield (
                 f"{trial.name}: {sensor} is {np.rad2deg(apart):.0f}° from the reference of "
-                f"{segment}; check that quaternions are scalar first (w, x, y, z), --up, and that "
-                "the mount is of this session"
+                f"{segment}; check that quaternions are scalar first (w, x, y, z), that --up is "
+                "correct, and that the mount is of this session"
             )
 
 

@@ -1,11 +1,11 @@
-"""Online learning: refits of the segment models to new frames with cameras.
+"""Online learning: refits of the segment models to new frames with camera data.
 
 Online learning changes only the models, not sensor-to-segment alignments, joint centers or lags. A
 candidate is fitted to the training frames of the calibration and the older part of the new frames.
 The candidate is compared with the current models on the newest frames, which are held out. The
-current models are retained, with a reason, in three cases: the candidate is not better, is much
-worse on the earlier training frames, or differs too much. Inconsistent cameras and sensors are an
-error.
+current models are retained, with a reason, in three cases: the candidate is not better, it is much
+worse on the earlier training frames, or its predictions differ too much from those of the current
+models. If cameras and sensors are inconsistent, the refit raises an error.
 """
 
 from __future__ import annotations
@@ -65,8 +65,8 @@ constant `WORSE_RAD` is added, as in `compare_calibrations`.
 WORSE_RAD = np.deg2rad(0.3)
 """Increase of an error on earlier frames that is accepted in addition to `WORSE`, rad."""
 MOST_CHANGE = np.deg2rad(8.0)
-"""Largest 0.95 quantile of the change of the predictions in known postures, rad. Soft tissue does
-not change faster.
+"""Largest 0.95 quantile of the change of the predictions for the earlier training frames, rad. Soft
+tissue does not cause a larger change.
 """
 MARKERS_RMS_M = 0.015
 """RMS residual of the markers of a frame above which the frame is ignored, m."""
@@ -77,8 +77,8 @@ CONTRADICTED = np.deg2rad(8.0)
 this angle one of the two is wrong.
 """
 SHIFTED = np.deg2rad(5.0)
-"""Largest length of the median rotation from the current models to the cameras, rad. A displaced
-marker cluster causes a larger rotation.
+"""Largest length of the median rotation vector from the orientations of the current models to those
+from the cameras, rad. A displaced marker cluster causes a larger rotation.
 """
 TURN_FRAMES = 150
 """Number of frames over which heading drift is assumed to be constant: 15 s."""

@@ -133,7 +133,7 @@ def fit_static_only(
 
     Without an alignment, every sensor world is assumed to equal the world of the static pose, as in
     the patent. If the headings of the sensors are arbitrary, only the inclination is then correct.
-    The calibration has the flag ``headings_from_static``.
+    The flag is ``headings_from_static`` without an alignment, ``facing_unknown`` with an alignment.
     """
     upright: Quaternion = (1.0, 0.0, 0.0, 0.0)
     flag = FrameFlag.FACING_UNKNOWN
@@ -185,8 +185,8 @@ def with_new_static(
 
     If the markers of a segment are visible and at their earlier positions on the body, they
     determine the current orientation of the segment. Otherwise, and in the procedure of the patent,
-    the segment is assumed to have the orientation and heading of the earlier pose (flag
-    ``same_pose_assumed``).
+    the segment is assumed to have the orientation and heading of the earlier pose. If the
+    calibration contains marker clusters, it then has the flag ``same_pose_assumed``.
 
     Parameters
     ----------
@@ -244,7 +244,7 @@ def with_new_static(
 
 
 def _label_exchanges(calibration: Calibration, pose: StaticPose) -> list[LabelFault]:
-    """Return exchanges of marker labels since the calibration, for parts that do not fit."""
+    """Return exchanges of marker labels in body parts that do not fit the calibration."""
     stored = calibration.clusters
     same = [
         name
@@ -263,7 +263,10 @@ def _label_exchanges(calibration: Calibration, pose: StaticPose) -> list[LabelFa
 def _part_rotation(
     old: StoredCluster | None, new: MarkerCluster | None
 ) -> NDArray[np.float64] | None:
-    """Return the rotation of a body part since its earlier pose; None if not visible."""
+    """Return the rotation of a body part since its earlier pose.
+
+    The result is None if the part is not visible or has other markers than in the earlier pose.
+    """
     if old is None or new is None or old.markers != new.markers or old.body != new.body:
         return None
     if old.body is not None:

@@ -101,7 +101,7 @@ def limb_training(
 
 
 def identical_sensors(chain: Chain, sensors: Mapping[str, Array]) -> list[str]:
-    """Return notes on sensors of a segment without relative motion, which are one device.
+    """Return notes on sensors of a segment without relative motion, which may be one device.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def identical_sensors(chain: Chain, sensors: Mapping[str, Array]) -> list[str]:
                 continue
             if float(np.max(rotation.angle_between(between[0], between))) < TWINS:
                 found.append(
-                    f"{a} and {b} are identical in every frame: check that they are not one "
-                    "device or recording under two names; a second sensor has no benefit then"
+                    f"{a} and {b} do not move relative to each other: check that they are not one "
+                    "device or recording under two names; the second one then has no benefit"
                 )
     return found

@@ -134,7 +134,8 @@ def _segment(name: str, segment: SegmentCalibration) -> Iterator[str]:
 def _wrong_types(model: Any) -> Iterator[str]:
     """Yield the fields of a model whose values do not have the annotated type.
 
-    An evaluation does not use all fields, because some apply only after the loss of a sensor.
+    `_model` does not find these faults, because an evaluation does not use the fields that apply
+    only after the loss of a sensor.
     """
     for field in fields(model):
         value = getattr(model, field.name)

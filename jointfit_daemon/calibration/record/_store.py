@@ -3,7 +3,7 @@
 Invariant: a stored version never changes, and a reader never finds an incomplete file. The text is
 written to a temporary file, flushed to the storage medium, and linked under the number of the
 version. Linking fails if the number exists. The directory is flushed last. After an interruption at
-any point the previous version is the newest.
+any point, the newest version is either the previous one or the complete new one.
 
 A file is ``{"sha256": …, "calibration": {…}}``; the checksum is computed from the calibration as
 JSON with sorted keys and without whitespace. A file with unusable content is renamed to ``….bad``
@@ -160,7 +160,7 @@ class CalibrationStore:
             known = ", ".join(map(str, self.versions())) or "none"
             raise CalibrationFileError(f"{path}: no such version; stored: {known}")
 
-        # A file with a read error may be readable later; a file with unusable content never is.
+        # A file with a read error may be readable later, but unusable content remains unusable.
         try:
             data = read_bounded(path, MOST_BYTES)
         except MalformedFileError as error:

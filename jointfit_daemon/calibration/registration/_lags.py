@@ -47,9 +47,9 @@ is still below 1°.
 """
 
 SENSOR_TISSUE_SD_NS = 2e6
-"""Standard deviation of the lag that soft tissue under a sensor causes, ns."""
+"""Standard deviation of the lag error that soft tissue under a sensor causes, ns."""
 MARKER_TISSUE_SD_NS = 3e6
-"""Standard deviation of the lag that soft tissue under the markers of a segment causes, ns."""
+"""Standard deviation of the lag error that soft tissue under segment markers causes, ns."""
 MAX_PRIOR_DEVIATION = 4.0
 """Difference between the lags on the plate and in the movement, in standard deviations, above which
 a clock or filter must have changed. The lag from the movement is then used alone.
@@ -78,6 +78,10 @@ def segment_lags(
 
     .. math:: \hat\tau = (P + C^{-1})^{-1} (P p + C^{-1} m), \quad
               C = \mathrm{diag}(\sigma_i^2 + \sigma_d^2) + \sigma_c^2 1 1^T
+
+    where m are the lags from the movement with standard deviations :math:`\sigma_i`, and p the lags
+    from the align phase. P is the diagonal matrix of the inverse variances of p.
+    :math:`\sigma_d` is `SENSOR_TISSUE_SD_NS`, and :math:`\sigma_c` is `MARKER_TISSUE_SD_NS`.
 
     Parameters
     ----------

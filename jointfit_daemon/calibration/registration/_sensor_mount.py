@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 AlignmentKind = Literal["full", "heading", "mount"]
 
 MAX_KAPPA_FULL = 0.95
-"""Largest kappa of an accepted full alignment."""
+"""Largest `SensorAlignment.kappa` of an accepted full alignment."""
 MAX_KAPPA_HEADING = 0.98
-"""Largest kappa of an accepted heading alignment."""
+"""Largest `SensorAlignment.kappa` of an accepted heading alignment."""
 MAX_WEAK_ERROR = np.deg2rad(1.0)
 """Largest standard error in the least observable direction of the full problem, rad."""
 _SAME = 1e-9
@@ -84,7 +84,7 @@ def fit_observable_alignment(
     Raises
     ------
     ValueError
-        Fewer than four complete frames.
+        There are fewer than four complete frames.
     """
     full = fit_sensor_alignment("full", q_world_sensor, q_optical_body)
     if full.kappa <= MAX_KAPPA_FULL and full.weak_error <= MAX_WEAK_ERROR:
@@ -121,7 +121,7 @@ def fit_sensor_alignment(
     Raises
     ------
     ValueError
-        Fewer than four complete frames.
+        There are fewer than four complete frames.
     """
     q_s = rotation.normalize(q_world_sensor)
     q_ref = rotation.normalize(q_optical_body)

@@ -141,7 +141,7 @@ def static_mount(
 def static_problems(
     means: Mapping[str, RobustMean], still_s: float, limits: StaticLimits | None = None
 ) -> tuple[str, ...]:
-    """Return the reasons for rejecting a static pose, one sentence each, or none if accepted.
+    """Return the reasons to reject a static pose, one sentence each; empty if it is accepted.
 
     Parameters
     ----------

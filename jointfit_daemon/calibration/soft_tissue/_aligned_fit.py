@@ -1,4 +1,7 @@
-"""Fit of the aligned mean, with world, sensor-to-segment alignment and weight of each sensor."""
+"""Fit of the aligned mean, which contains two alignments and a weight for each sensor.
+
+The alignments are the rotation of the sensor's world and the sensor-to-segment alignment.
+"""
 
 from __future__ import annotations
 

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 HULL_QUANTILE = 0.995
 """Quantile of the training leverage that defines the training range."""
 WIDTHS = (0.35, 0.5, 0.8)
-"""Candidate kernel widths, rad. The width is the distance over which joint rotations and tilts are
-correlated.
+"""Candidate kernel widths, rad. The width is the distance in joint rotation and tilt over which the
+corrections are correlated.
 """
 MOST_CENTERS = 24
 """Largest number of kernel centers (bumps)."""
@@ -41,7 +41,7 @@ class Fitted(NamedTuple):
 
     expert: KernelExpert
     unseen: tuple[Array, ...]
-    """Corrections of held-out frames for each grouping, rad, shape (n, 3)."""
+    """Predicted corrections of held-out frames, for each grouping, rad, shape (n, 3)."""
     ratios: tuple[Array, ...]
     """Leverage ratio of each held-out frame for each grouping, shape (n,)."""
 
@@ -49,9 +49,9 @@ class Fitted(NamedTuple):
 def fit_expert(u: Array, rho: Array, sensors: int, ways: Ways, *, tilted: bool) -> Fitted:
     """Fit one expert with the width that has the smallest squared error on held-out groups.
 
-    Penalties are combined by stacking once for each grouping, and the resulting fits are averaged.
-    Whole trials as groups measure the generalization to another movement; blocks in time measure
-    the generalization within a movement.
+    Fits with different penalties are combined by stacking, once for each grouping. The results are
+    averaged. Whole trials as groups measure the generalization to another movement; blocks in time
+    measure the generalization within a movement.
 
     Parameters
     ----------
@@ -100,8 +100,8 @@ def fit_expert(u: Array, rho: Array, sensors: int, ways: Ways, *, tilted: bool) 
 def spread_centers(x: Array) -> Array:
     """Return frames far from each other and from zero, shape (m, width).
 
-    At most 24 frames are selected. Each selected frame has the largest distance to all frames
-    selected before (farthest-point selection).
+    At most 24 frames are selected. Each selected frame has the largest distance from the nearest of
+    zero and the frames selected before (farthest-point selection).
 
     Parameters
     ----------

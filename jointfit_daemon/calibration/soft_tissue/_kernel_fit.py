@@ -1,4 +1,4 @@
-"""Fit of the kernel model, with experts, trend and claimed variance from held-out groups."""
+"""Fit of the kernel model, with widths, penalties and variances from held-out groups."""
 
 from __future__ import annotations
 

@@ -6,7 +6,8 @@ r"""Ridge regression on smooth terms and bumps (kernels); stacking combines the 
 .. math:: a_j = \arg\min_{a \ge 0,\ \sum a \le 1} \sum_i
           \bigl(\rho_{ij} - \sum_p a_p\, \hat\rho_{ijp}\bigr)^2
 
-for every axis j, where p numbers the penalties, g are the regressors and :math:`\hat\rho` the
+for every axis j, where p numbers the penalties :math:`\lambda` and their ratios r. n is the number
+of frames, w are the Huber weights of the final fit, g the regressors, and :math:`\hat\rho` the
 predictions of held-out frames (stacking: Breiman 1996). Regressors are not centered, because the
 regression must have no intercept. The shares a may sum to less than 1. The part of the correction
 that does not generalize to held-out frames is then omitted.
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     Masks = Sequence[NDArray[np.bool_]]
 
 PENALTIES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
-"""Ridge penalties. The model is the weighted sum of one fit for each penalty."""
+"""Ridge penalties. The model is the weighted sum of one fit for each penalty and ratio."""
 RATIOS = (1.0, 0.1, 10.0)
 """Ratios of the penalty of bumps to the penalty of smooth terms."""
 PASSES = 3
@@ -47,7 +48,7 @@ _HEAVY = 1e3
 _SMALLEST_SHARE = 1e-3
 """Share below which the fit of a penalty is omitted from the final sum."""
 _BUMPS_COUNT_AS = 5.0
-"""Number of smooth terms whose total scale equals the scale of all bumps together."""
+"""Sum of the mean squares of all bumps after scaling. The mean square of a smooth term is 1."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,10 +26,12 @@ FAR_SHARE = 0.1
 """Weight of the prior observation relative to all frames."""
 
 LEAST = 0.15
-"""Lower bound of the coefficients a and b as a fraction of the mean square error."""
+"""Lower bound of the coefficients a and b of `LeverageVariance`, as a fraction of the mean square
+error.
+"""
 
 PASSES = 5
-"""Iterations of the gamma regression."""
+"""Number of iterations of the gamma regression."""
 
 SMALLEST_VARIANCE = 1e-8
 """Lower bound of the mean square error, rad²."""
@@ -42,7 +44,11 @@ SMALLEST_LEVERAGE = 1e-12
 
 
 def hull(smooth: Array) -> Array:
-    """Return the matrix of leverages n s^T (S^T S + n p I)^-1 s of scaled smooth terms."""
+    """Return the matrix H, with which ``s @ H @ s`` is the leverage of a frame.
+
+    In scaled smooth terms the leverage is n s^T (S^T S + n c I)^-1 s. S contains the smooth terms s
+    of all n training frames, and c is `HULL_PENALTY`.
+    """
     n, p = smooth.shape
     scales = np.sqrt(np.mean(smooth**2, axis=0)) + 1e-3
     g = smooth / scales

@@ -1,7 +1,8 @@
 """Fits of the segment models of a limb for every set of available sensors, and their errors.
 
 The evaluation fits the models to the first part of a trial and measures errors on the contiguous
-last part. The stored models are then fitted to the whole trial.
+last part. The stored models are then fitted to the whole trial, except in the procedure of the
+patent.
 """
 
 from __future__ import annotations
@@ -206,7 +207,7 @@ def regression_quality(
     models : mapping
         The stored models of `fit_models` or `fit_verified_models`.
     share : float
-        Held-out part of the trial.
+        Fraction of the trial that is held out, at its end.
     """
     first, _ = _parts(training, share)
     found = {}

@@ -1,4 +1,4 @@
-"""Fits of the weighted mean, with equal weights, one best sensor, or weights from errors."""
+"""Fits of the weighted mean: equal weights, only the best sensor, or weights from the errors."""
 
 from __future__ import annotations
 

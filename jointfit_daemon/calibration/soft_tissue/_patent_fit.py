@@ -44,7 +44,7 @@ def _solve_separately(inputs: list[Array], target: Array) -> Array:
     rows = []
     for k in range(4):
         A = np.column_stack([*(q[:, k] for q in inputs), np.ones(len(target))])
-        rows.append(np.linalg.lstsq(A, target[:, k])[0])
+        rows.append(np.linalg.lstsq(A, target[:, k], rcond=None)[0])
     return np.array(rows)
 
 
@@ -56,5 +56,5 @@ def _solve_shared(inputs: list[Array], target: Array) -> Array:
         A[:, m] = q.T.reshape(-1)
     for k in range(4):
         A[k * n : (k + 1) * n, count + k] = 1.0
-    solved = np.linalg.lstsq(A, target.T.reshape(-1))[0]
+    solved = np.linalg.lstsq(A, target.T.reshape(-1), rcond=None)[0]
     return np.column_stack([np.tile(solved[:count], (4, 1)), solved[count:]])

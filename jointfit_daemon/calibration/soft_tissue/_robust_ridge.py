@@ -33,7 +33,9 @@ class Ridge:
     shape (p, p).
     """
     scales: Array
-    """RMS of each regressor in training, shape (p,). The scaled regressors are g = phi / scales."""
+    """RMS of each regressor in training plus `smallest_scale`, shape (p,). The scaled regressors
+    are g = phi / scales.
+    """
 
     def leverages(self, phi: Array) -> Array:
         """Return the leverage of each row, shape (n,)."""

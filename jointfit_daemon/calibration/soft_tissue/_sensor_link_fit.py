@@ -7,14 +7,16 @@ A link predicts the relation of two sensors from posture, by a weighted sum of p
 
     C = \Bigl(\frac{m}{\sigma_0^2} \overline{\phi\phi^\mathsf{T}} + \tau^{-2} S^2 \Bigr)^{-1}
 
-where :math:`\sigma_0` is the RMS residual on held-out blocks and :math:`S` the RMS of the
-polynomials. :math:`\tau`, the RMS of the predicted quantity, is the prior standard deviation of a
-weight (C. M. Bishop, Pattern Recognition and Machine Learning, 2006, section 3.3). The residuals of
-neighboring frames are similar, so the n frames count as
+where :math:`\sigma_0` is the RMS residual on held-out blocks and :math:`S` the diagonal matrix of
+the RMS values of the polynomials. :math:`\tau`, the RMS of the predicted quantity, is the prior
+standard deviation of the weight of a polynomial divided by its RMS (C. M. Bishop, Pattern
+Recognition and Machine Learning, 2006, section 3.3). The residuals of neighboring frames are
+similar, so the n frames count as m independent frames:
 
-.. math:: m = n \Big/ \Bigl(1 + 2 \sum_{k=1}^{K} \rho_k\Bigr)
+.. math:: m = n \Big/ \Bigl(1 + 2 \sum_{k=1}^{K} \rho_k \rho'_k\Bigr)
 
-where :math:`\rho` is the autocorrelation of the residuals, up to its first zero crossing.
+where :math:`\rho` is the autocorrelation of the residuals, :math:`\rho'` the autocorrelation of the
+polynomials, and K the last lag before :math:`\rho` becomes negative.
 """
 
 from __future__ import annotations
@@ -56,7 +58,7 @@ FEWEST_FRAMES = 100
 """Smallest number of complete frames."""
 
 LEAST_SPREAD = radians(0.3)
-"""Lower bound of the standard deviation of the residuals, rad."""
+"""Lower bound of the RMS residual and of the prior standard deviation, rad."""
 
 
 def fit_links(

@@ -4,7 +4,7 @@ The number of frames is limited. They are spread evenly over postures, and are t
 each posture. Postures are distinguished by the direction of gravity in the first segment and by the
 joint rotations. Each of these components is divided into cells of 0.25 rad.
 
-The encoding is text. A quaternion component is rounded to 1/32767, which is 0.003° of orientation.
+The encoding is text. Rounding of a quaternion component to 1/32767 causes an error of about 0.003°.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 MOST = 800
-"""Largest number of frames. The models have some hundred parameters, and a frame has 50 bytes."""
+"""Largest number of frames. The models have a few hundred parameters; a frame has 50 bytes."""
 CELL = 0.25
 """Width of a posture cell, rad."""
 MOVEMENTS = 3
@@ -63,7 +63,7 @@ def unpack(chain: Chain, text: str) -> LimbTraining | None:
 
 
 def join_training(old: LimbTraining, new: LimbTraining) -> LimbTraining:
-    """Return the frames of `old`, then of `new`, which get the label of another movement."""
+    """Return the frames of `old`, then those of `new`. The new frames get a new movement label."""
     before = _labels(old)
     labels = np.concatenate([before, np.full(len(new), before.max(initial=-1) + 1)])
     labels = np.maximum(labels - max(int(labels.max()) - MOVEMENTS + 1, 0), 0)

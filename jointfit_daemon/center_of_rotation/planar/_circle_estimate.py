@@ -181,7 +181,8 @@ def objection(radius: float, arc: float, T: float, sd: float, limits: CircleLimi
 
     if sd > limits.sd:
         return (
-            f"uncertain to {1000 * sd:.0f} mm, more than the {1000 * limits.sd:.0f} mm allowed: "
+            f"the predicted error is {1000 * sd:.0f} mm, above the limit of "
+            f"{1000 * limits.sd:.0f} mm: "
             "move the joint further or for longer"
         )
 

@@ -160,9 +160,9 @@ def temper(
     of the center is 1/κ. The mean square error of 1/κ is dominated by the few cases near κ = 0, and
     1/κ is too large on average. The distance 1/κ is therefore replaced by κ/(κ² + s²), Zellner's
     minimum expected loss estimator of an inverse (1978). The replacement removes the tail of the
-    error distribution, and removes the bias to second order. The error is 1 + 1/T² times the
-    Cramér-Rao bound. Without the replacement the factor is 1 + 4.5/T². On long arcs S is nearly the
-    identity.
+    error distribution, and removes the bias to second order. With T = κ/s, the error is 1 + 1/T²
+    times the Cramér-Rao bound. Without the replacement the factor is 1 + 4.5/T². On long arcs S is
+    nearly the identity.
     """
     xx, xy, yy = cov
     p, q, r = 1.0 + xx / square, xy / square, 1.0 + yy / square

@@ -1,6 +1,6 @@
 """Geometric circle fit: the maximum-likelihood estimate by Levenberg-Marquardt.
 
-On points without outliers the estimate equals the estimate of the Hyper fit. In addition, the
+Without outliers the estimate is nearly equal to the estimate of the Hyper fit. In addition, the
 geometric fit supports the Huber loss and several markers with one center.
 """
 

@@ -32,7 +32,9 @@ if TYPE_CHECKING:
 METHOD = "oriented"
 MAX_FRAMES = 300
 INCONSISTENT = 13.8
-"""Squared Mahalanobis distance of two estimates. Chance exceeds it once in a thousand cases."""
+"""Squared Mahalanobis distance above which two estimates are inconsistent. Of consistent pairs, one
+in a thousand has a larger distance.
+"""
 _LEAST_NOISE_M = 1e-4
 _PASSES = 40
 _FAR_M = 1.0
@@ -52,7 +54,7 @@ class AngleNoise:
     """Standard deviation of the scale error, rad/rad."""
 
     def covariance(self, times: Array, angles: Array) -> Array:
-        """Return the covariance Σ of slow and scale errors at these times, rad², shape (n, n)."""
+        """Return the covariance Σ of the angle errors at these times, rad², shape (n, n)."""
         slow = self.slow**2 * np.exp(-np.abs(times[:, None] - times) / self.time)
         turned = angles - angles.mean()
         return np.asarray(
@@ -78,9 +80,9 @@ def oriented_estimate(
 
     In the first line, c is the center, ρ the radius, u the unit vector at an angle, θ the measured
     angle of the child with error δ, and β the angle of the marker on the child. ε is marker noise
-    of variance σ². Plain least squares on the first line is attenuated by δ. The last term of J
-    subtracts the contribution of marker noise to aᵀMa. This contribution decreases with the
-    distance of the center, and would bias c outward.
+    of variance σ². In a plain least-squares fit of the first line, δ would reduce the radius. The
+    last term of J subtracts the contribution of marker noise to aᵀMa. This contribution decreases
+    with the distance of the center, and would bias c outward.
 
     The guard limits the effect of the angles (limited translation, Efron and Morris 1971). Let Δ be
     the difference between the center with angles and the center of the circle fit. Let E be the
@@ -233,7 +235,7 @@ def _solve(x: Array, theta: Array, sigma: float, Sigma: Array) -> tuple[Array, A
     center, covariance, residual or None
         Center, m, its covariance, m², and the RMS radial residual, m; None where J has no minimum.
     """
-    # start at the linear least-squares solution of x = c + R(θ) p, which is attenuated
+    # start at the linear least-squares solution of x = c + R(θ) p, whose radius is too small
     c, s, one, zero = np.cos(theta), np.sin(theta), np.ones_like(theta), np.zeros_like(theta)
     A = np.concatenate((np.column_stack((one, zero, c, -s)), np.column_stack((zero, one, s, c))))
     found = np.linalg.lstsq(A, x.T.ravel(), rcond=None)[0]

@@ -1,8 +1,9 @@
 """Circle fit of a stream of points, at constant cost per frame.
 
-Invariant: the result equals the batch fit of all frames with the same weights. Ten sums determine
-the circle, its covariance and the lag-one correlation of the residuals. The sums are plain floats,
-because a NumPy call on ten numbers takes longer than the arithmetic.
+Invariant: the result equals the batch fit of all frames with the same weights. Ten sums over the
+frames determine the circle and the variance of its residuals. Ten sums over pairs of successive
+frames determine the lag-one correlation of the residuals. The sums are plain floats, because a
+NumPy call on ten numbers takes longer than the arithmetic.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 r"""Error of a center that is computed from three frames, from the noise of each coordinate.
 
 The marker is at distance r from the center, at the angles θ₁, θ₂, θ₃. Source: Akbarifar et al.
-2021, section 2-2-2. These misprints of the source are corrected here. In equation 12 the
-denominator has a factor s, and a sum instead of a difference of sines. In equation 13 the terms of
-second order have the wrong sign. The mean squares are called standard deviations.
+2021, section 2-2-2. The following misprints of the source are corrected here. In equation 12, the
+denominator of the source contains a factor s, and a sum of sines instead of a difference. In
+equation 13, the terms of second order have the wrong sign. The source calls mean squares standard
+deviations.
 """
 
 from __future__ import annotations
@@ -75,8 +76,8 @@ def three_frame_mean_squares(angles: ArrayLike, noise: ArrayLike) -> Array:
     angles : array_like, shape (..., 3)
         Directions of the marker from the center in the three frames, rad.
     noise : array_like, broadcast to (..., 3, 2)
-        Standard deviations of x and y in each frame, m. Use six values, shape (3, 2), one value per
-        frame, shape (3, 1), one value per axis, shape (2,), or one value for all coordinates.
+        Standard deviations of x and y in each frame, m. The shape is (3, 2) for six values, (3, 1)
+        for one value per frame, (2,) for one value per axis, or () for one value.
 
     Returns
     -------

@@ -94,15 +94,16 @@ def three_frame_estimate(points: ArrayLike, noise: ArrayLike) -> CenterEstimate:
     points : array_like, shape (3, 2)
         One marker in three frames, m.
     noise : array_like, broadcast to (3, 2)
-        Standard deviations of x and y in each frame, m, which three points do not determine. Use
-        six values, shape (3, 2), one value per frame, shape (3, 1), one value per axis, shape (2,),
-        or one value for all coordinates.
+        Standard deviations of x and y in each frame, m. They must be given, because three points do
+        not determine them. The shape is (3, 2) for six values, (3, 1) for one value per frame,
+        (2,) for one value per axis, or () for one value.
 
     Returns
     -------
     CenterEstimate
-        Estimate with a covariance propagated to first order. The estimate is refused if points are
-        missing, on a line, or closer to a line than the noise.
+        Estimate with a covariance propagated to first order. The estimate is refused if a point is
+        missing, if the points are on a line, or if the predicted error exceeds a sixth of the
+        radius.
     """
     p = np.asarray(points, dtype=np.float64)
     variances = np.broadcast_to(np.asarray(noise, dtype=np.float64) ** 2, (3, 2))
@@ -120,7 +121,7 @@ def three_frame_estimate(points: ArrayLike, noise: ArrayLike) -> CenterEstimate:
     spokes = np.stack((-offset, u - offset, v - offset))
     # Radial noise e shifts the center by δ, with u·δ = r (e₂ - e₁) and v·δ = r (e₃ - e₁). Hence C =
     # r² A⁻¹ [[σ₁² + σ₂², σ₁²], [σ₁², σ₁² + σ₃²]] A⁻ᵀ with A = (u v)ᵀ and the radial variances σ².
-    # The unit of the sides u, v and the radius r cancels.
+    # The sides u, v and the radius r are divided by the largest side; this factor cancels in C.
     moves = float(np.hypot(*offset)) * np.linalg.inv(np.stack((u, v)))
     first, second, third = (variances * spokes**2).sum(axis=1) / (spokes**2).sum(axis=1)
     chords = np.array([[first + second, first], [first, first + third]])

@@ -204,7 +204,7 @@ def evaluate_sphere(
 ) -> CenterEstimate:
     r"""Return the estimate of a fit with its covariance, or a refused estimate.
 
-    .. math:: C = \frac{\sum ψ^2 / (N - k - r)}{p^2} \Big(\sum J J^T - \text{noise's part}
+    .. math:: C = \frac{\sum ψ^2 / (N - k - r)}{p^2} \Big(\sum J J^T - \text{contribution of noise}
               \Big)^{-1} \frac{1+\rho}{1-\rho}
 
     where ψ are the residuals limited to the Huber threshold, p is the fraction of residuals that

@@ -55,7 +55,7 @@ class SphereLimits:
 
     min_direction: float = 0.0
     """RMS rotation of the markers in the third direction, rad, below which the joint counts as a
-    hinge even with small noise. Use 3° with soft-tissue artefact. The value must exceed the
+    hinge even if the noise is small. With soft-tissue artefact use 3°. The value must exceed the
     rotation of the parent's frame that noise causes, because such a rotation cannot be
     distinguished from joint rotation.
     """
@@ -160,14 +160,15 @@ def observe(
 def soft_tissue_variance(
     left: ResidualStatistics, paths: MarkerPaths, found: ConcentricSpheres
 ) -> float:
-    r"""Return the variance of the soft-tissue artefact, m².
+    r"""Return p² times the weighted number of marker positions, m².
 
-    The caller multiplies this variance by the inverse of the information matrix.
+    The caller multiplies the result by the inverse of the information matrix, which is a sum over
+    all marker positions. The product is the covariance from soft-tissue artefact,
 
     .. math:: \mathrm{Cov}_{posture} = p^2 \left[ \overline{u u^T} - \bar u \bar u^T \right]^{-1}
 
-    p² is the persistent variance of the residuals, and u are the unit vectors from the center to
-    the markers. The part of the artefact that is linear in u moves the center without residuals.
+    where p² is the persistent variance of the residuals, and u are the unit vectors from the center
+    to the markers. The part of the artefact that is linear in u moves the center without residuals.
     This part is assumed to be as large as the part that causes residuals. The artefact repeats with
     every cycle, and all markers share the soft tissue of their parent. Therefore neither more
     frames nor more markers reduce this variance.
@@ -249,7 +250,7 @@ def _observed_center(
 
 
 def _no_better(spread: Array, white: Array) -> Array:
-    """Return `spread`, which is increased to at least a quarter of the white-noise covariance.
+    """Return `spread`, increased to at least a quarter of the white-noise covariance.
 
     With few frames, chance correlations between markers could cancel all noise.
     """

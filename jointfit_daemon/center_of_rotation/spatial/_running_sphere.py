@@ -39,7 +39,7 @@ OFF = 8.0
 """
 OFF_M = 0.01
 STAYED_OFF = 25
-"""Number of consecutive frames off its sphere after which a marker is restarted at its new
+"""Number of consecutive frames after which a marker that is off its sphere is restarted at its new
 position.
 """
 _FAR_M = 2.0
@@ -53,8 +53,9 @@ class _ExpectedMarkers:
     """Marker positions expected from the last estimate."""
 
     f: Array
-    """Coefficients f of the radial residual f·φ of each marker, m, shape (k, e); zero for a marker
-    without estimate.
+    """Coefficients f of the radial residual f·φ of each marker, shape (k, e); zero for a marker
+    without estimate. With the marker position p relative to its fixed point, φ = (p², p, 1), and
+    e = d + 2. The residual is in m.
     """
     noise: Array
     """Standard deviation of a coordinate of each marker, m, shape (k,); inf where unknown."""
@@ -89,12 +90,12 @@ class RunningSphere:
         artefact here.
     shape : ndarray, shape (k, d, d), optional
         Covariance of each marker's noise relative to the common variance, as returned by
-        ``relative``.
+        `_parent_frame_noise.relative`; isotropic noise if None.
 
     Raises
     ------
     ValueError
-        There are no markers, or `forgetting` is outside (0, 1].
+        There are no markers, `forgetting` is outside (0, 1], or `dimension` is neither 2 nor 3.
     """
 
     def __init__(

@@ -28,8 +28,9 @@ def fit_axis(
 ) -> CenterEstimate:
     """Estimate the axis of a hinge and the point of the axis nearest to `near`.
 
-    The axis is the right singular vector of [R₁, -R₂] with the smallest singular value, where R₁
-    and R₂ are the rotations of parent and child in all frames. Source: Ehrig et al. 2007.
+    The right singular vector of [R₁, -R₂] with the smallest singular value consists of the axis in
+    the coordinates of parent and child. R₁ and R₂ are the rotations of parent and child in all
+    frames. Source: Ehrig et al. 2007.
 
     Parameters
     ----------
@@ -37,7 +38,7 @@ def fit_axis(
         Poses of both bodies in the same world coordinates.
     near : ndarray, shape (3,), optional
         Point in the parent's coordinates, m. The center is the point of the axis that is nearest to
-        this point. None is the parent's origin.
+        this point. By default, it is the parent's origin.
     toward : ndarray, shape (3,), optional
         Direction along which the axis has a positive component, such as the subject's right.
     robust : bool

@@ -105,7 +105,7 @@ def two_sided_estimate(
         Poses of both bodies in the same world coordinates; frames with NaN are ignored.
     near : ndarray, shape (3,), or None
         Point in the parent's coordinates, m. The center of a hinge is the point of the axis that is
-        nearest to this point. None is the parent's origin.
+        nearest to this point. None stands for the parent's origin.
     hinge : bool
         Whether to solve always for an axis, without the sixth singular value. If False, the result
         is an axis only if the ratio of the last two singular values is below `HINGE_RATIO`.

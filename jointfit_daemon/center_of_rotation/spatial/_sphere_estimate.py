@@ -70,7 +70,7 @@ def center_of(
         Position of the center along unobserved directions, m; the mean of the markers if None.
     shape : ndarray, shape (k, d, d), optional
         Noise covariance of each marker relative to the common variance; isotropic noise if None.
-        For a moving parent, ``relative`` returns these covariances.
+        For a moving parent, `_parent_frame_noise.relative` returns these covariances.
     limits : SphereLimits, optional
         Acceptance limits.
 

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 
 HUBER = 1.5
-"""Length of the gap, in standard deviations of a coordinate, above which the weight of a frame is
-reduced.
+"""Half the length of the gap, in standard deviations of a coordinate, above which the weight of a
+frame is reduced.
 """
 MEDIAN_LENGTH = 1.538
 """Median length of a vector of three standard normal components."""
@@ -230,7 +230,7 @@ def _remaining_noise(
               δA = (E_1 [δφ_1]_×, \; -E_2 [δφ_2]_×), \qquad
               \mathrm{Cov}(δφ) = \mathrm{diag}(G_i^{-1}) - K V K^T
 
-    per noise variance. A is the derivative of the gap with respect to the point, V the inverse
+    for unit noise variance. A is the derivative of the gap with respect to the point, V the inverse
     covariance of the gap, and w the weight of frame t. Cov(δφ) is the covariance of the rotations
     after the correction by the gap.
     """

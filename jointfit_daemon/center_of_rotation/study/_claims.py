@@ -1,4 +1,4 @@
-"""Tests of two claims about three-frame centers in the source of the study.
+"""Tests of two claims that the source of the study makes about three-frame centers.
 
 The source (Akbarifar et al. 2021) recommends repeating movements with small angles α and averaging
 the results. It also states that the distance r of the marker has an effect only if the noise is
@@ -55,7 +55,7 @@ def average_repetitions(setup: StudySetup) -> Repetition:
 
 
 def effect_of_radius(setup: StudySetup) -> Array:
-    """Return the error at each of `RADII_M`, divided by the error at the largest radius.
+    """Return the error at each of `RADII_M`, relative to the largest radius of the setup.
 
     The result uses the 95th percentile of the error, because the mean square is not finite. The
     noise is `LARGE_NOISE_M`, and the step is the fixed step of the setup.

@@ -77,7 +77,8 @@ def oriented_centers(points: Array, angles: Array, interval: float = 0.02) -> Ar
     noise = np.maximum(noise, _LEAST_NOISE_M)
     found, H = start, np.zeros((len(z), 4, 4))
 
-    # The covariance of the scale error uses the true angles, which increase evenly.
+    # The covariance of the scale error uses a linear fit to the measured angles, because the true
+    # angles increase evenly.
     values, U = _is_wandering(n, interval)
     even = np.arange(n) - 0.5 * (n - 1)
     g = _TOLD.gain * np.outer(theta @ even, even) / (even @ even)

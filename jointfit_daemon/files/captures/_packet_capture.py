@@ -269,7 +269,7 @@ class _IpPacket(NamedTuple):
 
 
 def _ip_packet(packet: bytes) -> _IpPacket | None:
-    """Return an IPv4 packet of UDP or TCP; None for other protocols and truncated headers."""
+    """Return an IPv4 or IPv6 packet of UDP or TCP; None for any other or truncated packet."""
     version = packet[0] >> 4 if packet else 0
     found = None
     if version == 4 and len(packet) >= _IPV4_HEAD:  # noqa: PLR2004 - IPv4
@@ -296,7 +296,7 @@ def _ipv6_packet(packet: bytes) -> _IpPacket | None:
             units = 0
         kind, at = following, at + 8 * (units + 1)
         if fields & 0xFFF8:
-            break  # extension headers behind the first fragment are in its body
+            break  # only the first fragment contains further headers
     return _IpPacket(kind, packet[8:40], number, bool(fields & 1), fields & 0xFFF8, packet[at:end])
 
 

@@ -118,7 +118,7 @@ class _Direction:
             self._use(self._waiting.pop(self._next), continues=True)
 
     def _skip_hole(self) -> None:
-        """Continue with the earliest waiting segment, and count the missing bytes as lost."""
+        """Continue with the earliest waiting segment, and mark the hole before it, if any."""
         known = self._next or 0
         first = min(self._waiting, key=lambda sequence: (sequence - known) % _NUMBERS)
         self._use(self._waiting.pop(first), continues=(first - known) % _NUMBERS >= _NUMBERS // 2)

@@ -41,7 +41,7 @@ list."""
 _MOST_BYTES = 255
 """Largest size of a text in a list parameter, bytes."""
 _MOST_BLOCKS = 255
-"""Largest number of blocks of all parameters."""
+"""Largest number of blocks of the parameter section."""
 
 
 class C3dEvent(NamedTuple):
@@ -88,7 +88,7 @@ def c3d_bytes(
     Raises
     ------
     ValueError
-        More parameters than the format can hold.
+        The labels, events and texts need more space than the format provides.
     """
     frames, points = positions.shape[:2]
     last_frame = first_frame + frames - 1

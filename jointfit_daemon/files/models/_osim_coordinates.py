@@ -25,7 +25,7 @@ _X, _Y, _Z = to_z_up(np.eye(3)).argmax(axis=1).tolist()
 
 
 def joint_coordinates(segment: Segment, joint: OsimJoint, placed: Array) -> JointCoordinates:
-    """Return the moving coordinates of a joint, in the order of the file.
+    """Return the coordinates that move the child of a joint and are not locked, in file order.
 
     Parameters
     ----------

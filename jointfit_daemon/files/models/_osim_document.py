@@ -140,7 +140,7 @@ def read_document(path: Path) -> OsimDocument:
 
 
 def read_xml(path: Path) -> ET.Element:
-    """Return the root of an XML file; raise `MalformedFileError` for a document type."""
+    """Return the root of an XML file without document type; else raise `MalformedFileError`."""
     reject_device(path)
     if path.stat().st_size > LARGEST:
         raise MalformedFileError(
@@ -202,11 +202,13 @@ def numbers_of(element: ET.Element, tag: str, count: int | None = None) -> Array
     try:
         values = np.array([float(cell) for cell in text_of(element, tag).split()])
     except ValueError:
-        values = np.array([np.nan])
-        count = count or 0  # text without numbers is an error for any expected count
-    if count is not None and (values.size != count or not np.isfinite(values).all()):
+        values = None
+    if values is None or (
+        count is not None and (values.size != count or not np.isfinite(values).all())
+    ):
         name, found = element.get("name", element.tag), element.find(tag)
-        expected = "one number" if count == 1 else f"{count} numbers with blanks between them"
+        number = "" if count is None else f"{count} "
+        expected = "one number" if count == 1 else f"{number}numbers with blanks between them"
         raise ValueError(
             f"line {line_of(element if found is None else found)}: {element.tag} {name!r}: {tag} "
             f"is {text_of(element, tag)!r}, expected {expected}: correct it in this line, or save "

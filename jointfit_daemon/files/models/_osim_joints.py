@@ -47,7 +47,7 @@ _TELL_M, _TELL_RAD = 1e-4, 1e-3
 
 @dataclass(frozen=True, slots=True)
 class NearestJoint:
-    """Joint of the chain model in OpenSim's axes; the kind ``weld`` means no joint."""
+    """Joint of the chain model in OpenSim's axes; the kind None is a rigid connection."""
 
     kind: JointKind | None
     rest: Array
@@ -134,7 +134,7 @@ def _centers(joint: OsimJoint, turns: Array, shifts: Array) -> tuple[Array, Arra
     design = np.concatenate((turns, fixed), axis=-1).reshape(-1, 6)
     pull = _AT_HOME * np.sqrt(len(turns)) * np.eye(6)
     wanted = np.concatenate(((middle - seen).ravel(), np.zeros(6)))
-    shift = np.linalg.lstsq(np.concatenate((design, pull)), wanted)[0]
+    shift = np.linalg.lstsq(np.concatenate((design, pull)), wanted, rcond=None)[0]
     missed = np.linalg.norm(seen + turns @ shift[:3] - middle - shift[3:], axis=-1)
     return middle + shift[3:], own + shift[:3], float(missed.max())
 
@@ -191,7 +191,7 @@ def _about_one(
 def _coupled_joint(
     joint: OsimJoint, motion: JointMotion, coordinate: Coordinate, welded: NearestJoint
 ) -> NearestJoint:
-    """Return a joint as samples of its motion, which extend beyond its range, with the errors."""
+    """Return a coupled joint from samples of the motion, and a remark with its largest errors."""
     low, high = _span(coordinate)
     zero = min(max(0.0, low), high)
     values = np.linspace(low - _BEYOND, high + _BEYOND, 2 * _SAMPLES - 1)

@@ -82,22 +82,22 @@ class JointMotion:
         else:
             raise ValueError(f"joint {joint.name}: {joint.kind} is not supported")
         if len(axes) != 2 * _TURNING:
-            raise ValueError(f"joint {joint.name}: {len(axes)} transform axes")
+            raise ValueError(f"joint {joint.name}: {len(axes)} transform axes, expected 6")
         self._axes = axes
 
     @property
     def second_rotation(self) -> str:
-        """Coordinate of the second rotation; empty if there is none."""
+        """Name of the coordinate of the second rotation; empty if there is none."""
         return self._axes[1][0]
 
     @property
     def turning(self) -> frozenset[str]:
-        """Coordinates that rotate the child."""
+        """Names of the coordinates that rotate the child body."""
         return self._driving_functions(self._axes[:_TURNING])
 
     @property
     def shifting(self) -> frozenset[str]:
-        """Coordinates that translate the child."""
+        """Names of the coordinates that translate the child body."""
         return self._driving_functions(self._axes[_TURNING:])
 
     def _driving_functions(self, axes: list[tuple[str, Array, Function]]) -> frozenset[str]:
@@ -136,7 +136,7 @@ def _custom(axis: Element) -> tuple[str, Array, Function]:
 
     names = text_of(axis, "coordinates").split()
     if len(names) > 1:
-        raise ValueError(f"{axis.get('name')}: a function of {len(names)} coordinates")
+        raise ValueError(f"{axis.get('name')}: a function of {len(names)} coordinates, expected 1")
 
     written = [child for child in axis if child.tag not in {"coordinates", "axis"}]
     if len(written) == 1 and written[0].tag == "function":
@@ -173,14 +173,14 @@ def _scalar(element: Element, tag: str, default: float) -> float:
 def _through_points(element: Element) -> Function:
     """Return a curve through points, extrapolated linearly.
 
-    In OpenSim, the ends of a SimmSpline follow the cubic through their four nearest points. Here
-    they follow the cubic of the two nearest pieces. The difference is micrometres and occurs only
-    in the end pieces. OpenSim evaluates a NaturalCubicSpline as a SimmSpline, and so does this
-    function.
+    In OpenSim, the first and the last piece of a SimmSpline follow the cubic through the four
+    nearest points. Here, each of them continues the cubic of the adjacent piece. The difference is
+    a few micrometres in these pieces. OpenSim evaluates a NaturalCubicSpline as a SimmSpline, and
+    so does this function.
     """
     x, y = numbers_of(element, "x"), numbers_of(element, "y")
     if x.size != y.size or x.size <= 1 or not (np.diff(x) > 0.0).all():
-        raise ValueError(f"{element.tag}: its x must grow and have a y each")
+        raise ValueError(f"{element.tag}: its x values must increase, and each needs one y value")
     if element.tag == "PiecewiseLinearFunction" or x.size < _CUBIC:
         return lambda q: np.asarray(np.interp(q, x, y))
     spline = CubicSpline(x, y)

@@ -22,7 +22,7 @@ class IkSetup:
     time_range: tuple[float, float] | None
     """First and last time of the trial to evaluate, s; None if the file contains no range."""
     ignored: tuple[str, ...]
-    """Names of the coordinate tasks; the program ignores these tasks."""
+    """Names of the applied coordinate tasks, which the program ignores."""
 
 
 def read_ik_setup(path: Path) -> IkSetup:

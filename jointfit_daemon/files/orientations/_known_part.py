@@ -101,7 +101,7 @@ def _outcome(
     if not columns.all():
         left_out = [name for name, kept in zip(names, columns, strict=True) if not kept]
         notes.append(
-            f"{path.name}: columns known in less than half of the frames left out:"
+            f"{path.name}: left out, because they are known in less than half of the frames:"
             f" {list_names(left_out)}"
         )
     if frames < count:

@@ -267,8 +267,8 @@ def read_bids_session(root: Path) -> SessionData:
     if len(recordings) != 1:
         found = ", ".join(sorted(recordings)[:4]) or "no file _motion.tsv"
         raise MalformedFileError(
-            f"{root}: found {found}, expected a data set with one subject and one task: copy them"
-            " into a folder of their own"
+            f"{root}: found {found}, expected a data set with one subject and one task: copy one"
+            " subject and task into a separate folder"
         )
     streams, starts, name = [], [], root.name.removesuffix("_bids")
     for path in files:
@@ -347,7 +347,7 @@ def _read_motion(path: Path, width: int) -> Any:
 
 
 def _channel_of(row: Mapping[str, str]) -> StreamColumn | None:
-    """Return the column that the description of a channel names, or else its type; or None."""
+    """Return the column from a channel's description, or else from its type; None if unknown."""
     quantity, _, component = row.get("description", "").partition(" ")
     item = row.get("tracked_point", "")
     placement = row.get("placement", _MISSING)

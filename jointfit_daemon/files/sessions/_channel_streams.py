@@ -120,7 +120,7 @@ def streams_of(session: SessionData) -> list[ChannelStream]:
 
 
 def merge_streams(streams: Sequence[ChannelStream]) -> list[ChannelStream]:
-    """Merge the streams of a group that have common times; return all streams."""
+    """Merge the streams of each group whose streams all have the same times; return all streams."""
     merged = []
     for group in GROUPS:
         own = [stream for stream in streams if stream.group == group]
@@ -140,7 +140,7 @@ def session_of(
     events: Sequence[TimelineEvent] = (),
     description: Mapping[str, str] | None = None,
 ) -> SessionData:
-    """Return the session that consists of the given streams."""
+    """Return the session that consists of the given streams, events and description."""
     found: dict[str, list[Any]] = {group: [] for group in GROUPS}
     markers: MarkerSeries | None = None
     for stream in streams:

@@ -124,7 +124,7 @@ def _read_sensor(path: Path) -> _DotFile:
     ticks = columns[_TIME]
     if not np.isfinite(ticks).all():
         raise MalformedFileError(
-            f"{path}: rows without {_TIME}: export the recording again, all of them have one"
+            f"{path}: rows without {_TIME}: export the recording again, with this value in all rows"
         )
     t_s = unwrap_counter(ticks, _TURN) * _TICK_S
     require_times(path, t_s)

@@ -7,8 +7,8 @@
 | ``/joints/NAME`` | JSON | angles and standard deviations in degrees, position in m |
 | ``/events`` | Log | events |
 
-Unknown orientations and occluded markers are omitted. Topics of data from the markers begin with
-``/optical``.
+Unknown orientations and occluded markers are omitted. The topics and coordinate frames of segments
+and joints that were computed from the markers begin with ``optical``.
 """
 
 from __future__ import annotations

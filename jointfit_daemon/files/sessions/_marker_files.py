@@ -58,8 +58,8 @@ def write_c3d_session(session: SessionData, folder: Path) -> WrittenSession:
     path = folder / f"{session.name}.c3d"
     notes = axis.note(path.name)
 
-    # Frame 1 is at 0 s. A parameter of the group JOINTFIT stores the remainder of less than a
-    # period.
+    # Frame 1 is at 0 s. A frame number stands for a whole number of periods, so a parameter of the
+    # group JOINTFIT stores the exact time of the first frame.
     first_s = float(axis.t_s[0]) if len(axis.t_s) else 0.0
     first_frame = round(first_s * axis.rate_hz) + 1
     if not 1 <= first_frame <= _LATEST_FRAME:

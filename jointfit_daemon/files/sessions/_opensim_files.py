@@ -40,7 +40,8 @@ _POSITION_PARTS = (("_x", "_y", "_z"), ("_tx", "_ty", "_tz"))
 """Endings of the names of position columns: of this project, and of OpenSim's coordinates."""
 _TRANSLATION = re.compile(r"_t?[xyz]$")
 _LATE_START_S = 1.0
-"""Longest beginning of a session that orientation files omit until all series have started, s."""
+"""Longest time at the beginning of a session that is omitted, because a series has not started,
+s."""
 _SAME_INSTANT_S = 1e-6
 _GROUPS = ("sensors", "segments", "optical_segments")
 
@@ -91,7 +92,7 @@ def write_sto_session(
         files.append(path)
         notes += axis.note(path.name)
         if np.isnan(table.quaternions[0]).any():
-            notes.append(f"{path.name}: IMUPlacer needs all orientations of the first frame")
+            notes.append(f"{path.name}: the first frame lacks orientations that IMUPlacer needs")
     return _session_summary(session, "orientations, which STO files hold", files, notes)
 
 
@@ -158,9 +159,9 @@ def write_mot_session(session: SessionData, folder: Path) -> WrittenSession:
 def read_mot_session(path: Path) -> SessionData:
     """Return the joints of a MOT or STO file with one number in each cell.
 
-    In files of other programs, every column becomes a joint with one angle, called ``angle``.
-    Position columns are the exception, in m with y up: ``NAME_tx``, ``NAME_ty`` and ``NAME_tz``, or
-    ``NAME_x``, ``NAME_y`` and ``NAME_z``.
+    In files of other programs, every column becomes a joint with one angle, called ``angle``. The
+    exception is position columns, in m with y up: ``NAME_tx``, ``NAME_ty`` and ``NAME_tz``, or
+    ``NAME_x``, ``NAME_y`` and ``NAME_z``. Three such columns become the positions of a joint.
     """
     table = read_sto(path)
     facts = header_facts(table.header)

@@ -102,7 +102,7 @@ def _read_csv(path: Path, columns: Sequence[str]) -> Table:
         else:
             try:
                 table[name] = np.array([text or "nan" for text in texts], dtype=np.float64)
-            except ValueError:  # find the wrong cell
+            except ValueError:  # `number` raises an error that names the wrong cell
                 numbers = [number(path, k, text) for k, text in enumerate(texts, start=2)]
                 table[name] = np.array(numbers)
     return table

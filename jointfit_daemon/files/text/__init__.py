@@ -1,4 +1,4 @@
-"""Bounded reading of TOML, JSON and tables of numbers; conversion of values to TOML text."""
+"""Reading of TOML, JSON and tables of numbers with limited memory; writing of TOML values."""
 
 from jointfit_daemon.files.text._structured import (
     MAX_NESTING,

@@ -70,7 +70,7 @@ def compared_pairs(group: Sequence[str]) -> list[tuple[str, str]]:
     """Return the pairs of sensors of one segment that are compared, in the order of `group`.
 
     If a segment has many sensors, the first is compared with all others. Each of the others is also
-    compared with its two neighbours in a ring. A single slipped sensor then contradicts exactly its
+    compared with its two neighbors in a ring. A single slipped sensor then contradicts exactly its
     own pairs, even if another sensor is lost.
     """
     pairs, last = combinations(range(len(group)), 2), len(group) - 1
@@ -258,7 +258,9 @@ class ConsistencyMonitor:
             drift.add_measurement(
                 pair.heading + self._sensor_drift[link.b] - self._sensor_drift[link.a]
             )
-        for name in self._preceding[link.a]:  # the differences must form a forest
+        # The differences must form a graph without cycles, so only the pairs of the first sensor
+        # with data are used.
+        for name in self._preceding[link.a]:
             if name in inputs:
                 return ()
         return (HeadingDifference(link.a, link.b, pair.heading, link.spread),)

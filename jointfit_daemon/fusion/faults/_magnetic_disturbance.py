@@ -89,8 +89,8 @@ class MagneticDisturbanceDetector:
         absent.
         """
         self.ambiguity = 0.0
-        """Standard deviation of all headings if two halves of the sensors contradict each other,
-        rad.
+        """Standard deviation that a disturbance adds to all headings, rad. It is largest if two
+        halves of the sensors contradict each other.
         """
         self._before_ns: int | None = None
         self._deviations: dict[str, float] = {}

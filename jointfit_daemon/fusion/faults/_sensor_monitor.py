@@ -1,8 +1,7 @@
-"""State of every sensor of a limb (ok, lost, stuck) and reports of its changes.
+"""State of every sensor of a limb (ok, lost or stuck), and reports of changes of the state.
 
-Fusion excludes a lost or stuck sensor from the frame in which the fault is detected. The report is
-delayed by `REPORT_DELAY_NS`, so that single lost samples and loose connectors do not cause many
-events.
+Fusion excludes a lost or stuck sensor as soon as the fault is detected. The report is delayed by
+`REPORT_DELAY_NS`, so that single lost samples and loose connectors do not cause many events.
 
 Invariant: the cost per frame is O(1), and no two successive reports of a sensor have the same
 state.

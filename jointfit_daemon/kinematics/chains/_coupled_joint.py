@@ -53,7 +53,7 @@ class CoupledCurve:
         rows = np.array(path, dtype=np.float64)
         q = rows[:, 1:5]
         flips = np.cumprod(np.where((q[1:] * q[:-1]).sum(axis=1) < 0.0, -1.0, 1.0))
-        # q and -q are the same rotation, but the spline requires continuous signs
+        # a quaternion and its negative are the same rotation, but a spline needs continuous signs
         rows[1:, 1:5] *= flips[:, None]
         pieces = np.asarray(CubicSpline(rows[:, 0], rows[:, 1:]).c)
         return cls(rows[:, 0], pieces, rows[:, 0].tolist(), pieces.transpose(1, 2, 0).tolist())
@@ -123,7 +123,10 @@ class CoupledCurve:
         return np.array((R,)), np.array(((amount, *shift, *turns, *slides),))
 
     def nearest(self, turned: Array) -> Array:
-        """Return the coordinates, (T,), of the poses nearest to rotations, (T, 3, 3)."""
+        """Return the coordinates, (T,), of the poses nearest to rotations, (T, 3, 3).
+
+        Each result is one of `_GUESSES` evenly spaced coordinates.
+        """
         tried = np.linspace(self.knots[0], self.knots[-1], _GUESSES)
         match = turned.reshape(-1, 9) @ self.at(tried)[0].reshape(-1, 9).T
         return np.asarray(tried[match.argmax(axis=1)])

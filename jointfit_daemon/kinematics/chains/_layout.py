@@ -45,7 +45,7 @@ class ChainLayout:
     """Index and degrees of freedom of each segment."""
     turns: Array
     """Axis (x, y, z, 0) of each rotational degree of freedom, and a point (x, y, z, 1) on the axis,
-    in segment axes, shape (nq, 4, 2). The axis of a translation is zero.
+    in segment axes, shape (nq, 4, 2). The axis is zero for translations and coupled joints.
     """
     shifts: Index
     """Indices of the degrees of freedom that translate a free segment."""

@@ -105,9 +105,9 @@ class ChainModel:
     Raises
     ------
     InvalidChainModelError
-        Duplicate names, unknown parents or segments, parents after children, a free joint with a
-        parent, axes or rest rotations that do not have unit length, empty limits, or values that
-        are not finite.
+        There are no segments, duplicate names, unknown parents, segments or joint kinds, parents
+        after children, a free joint with a parent, axes or rotations that do not have unit length,
+        empty limits, an invalid path, negative weights, or values that are not finite.
     """
 
     segments: tuple[Segment, ...]
@@ -128,7 +128,7 @@ class ChainModel:
 
     @cached_property
     def nq(self) -> int:
-        """Degrees of freedom."""
+        """Number of degrees of freedom."""
         return sum(DEGREES_OF_FREEDOM[s.joint.kind] for s in self.segments)
 
     @cached_property
@@ -170,7 +170,7 @@ class ChainModel:
 
     @cached_property
     def columns(self) -> tuple[slice, ...]:
-        """Columns of a step by segment, with rotations before translations."""
+        """Columns of each segment in a step of all coordinates; rotations precede translations."""
         ends = np.cumsum([0, *(DEGREES_OF_FREEDOM[s.joint.kind] for s in self.segments)]).tolist()
         return tuple(slice(a, b) for a, b in pairwise(ends))
 
@@ -232,15 +232,15 @@ def _wrong_joint(s: Segment) -> list[str]:
     if j.kind not in DEGREES_OF_FREEDOM:
         wrong.append(f"joint {j.kind!r}, expected one of {', '.join(DEGREES_OF_FREEDOM)}")
     if j.kind == "free" and s.parent is not None:
-        wrong.append("a free joint has no parent")
+        wrong.append("a free joint must not have a parent")
     if not np.isfinite([*j.center_in_parent, *j.center, *j.axis, *j.rest]).all():
-        wrong.append("its joint is not finite")
+        wrong.append("its joint contains values that are not finite")
 
     for what, values in (("axis", j.axis), ("rest", j.rest)):
         if abs(float(np.linalg.norm(values)) - 1.0) > _UNIT_TOLERANCE:
             wrong.append(f"{what} {values} is not of length 1")
     if j.limits is not None and not j.limits[0] < j.limits[1]:
-        wrong.append(f"limits {j.limits} leave no angle")
+        wrong.append(f"limits {j.limits}, expected a lower limit below the upper limit")
     return wrong + _wrong_path(j)
 
 
@@ -252,7 +252,8 @@ def _wrong_path(j: Joint) -> list[str]:
     path = np.array(j.path)
     if not np.isfinite(path).all():
         return ["its path is not finite"]
-    wrong = [] if (np.diff(path[:, 0]) > 0.0).all() else ["the coordinate of its path must grow"]
+    rising = (np.diff(path[:, 0]) > 0.0).all()
+    wrong = [] if rising else ["the coordinate of its path must increase from sample to sample"]
     if (np.abs(np.linalg.norm(path[:, 1:5], axis=1) - 1.0) > _UNIT_TOLERANCE).any():
         wrong.append("a quaternion of its path is not of length 1")
     return wrong
@@ -267,7 +268,7 @@ def _wrong_markers(segments: tuple[Segment, ...], markers: tuple[Marker, ...]) -
         if not np.isfinite(m.position).all():
             wrong.append(f"marker {m.name!r}: position {m.position} is not finite")
         if not 0.0 <= m.weight < float("inf"):
-            wrong.append(f"marker {m.name!r}: weight {m.weight}")
+            wrong.append(f"marker {m.name!r}: weight {m.weight}, expected 0 or more, finite")
     return wrong
 
 

@@ -142,8 +142,9 @@ def jacobian(model: ChainModel, state: ChainState) -> Array:
     .. math:: \partial x_m/\partial q_k = \alpha_k \times (x_m - C_k)
 
     where α is the world axis of the rotation and C a point on this axis. The equation applies to
-    the rotations of all joints between the world and the marker's segment. The derivative is the
-    identity for translations of the root of the chain, and zero for all other degrees of freedom.
+    the rotations of all joints between the world and the marker's segment. For a coupled joint, the
+    translation along its path is added. The derivative is the identity for translations of the root
+    of the chain, and zero for all other degrees of freedom.
     """
     layout = layout_of(model)
     world = transforms(layout, state)

@@ -105,7 +105,7 @@ def closed_form(joint: JointCoordinates, kind: JointKind) -> ClosedForm | None:
             continue
         A, t = found.pose(probes)
         off = float(np.abs(A - expected[0]).max())
-        if shifts:  # without a free joint the parent determines the origin
+        if shifts:  # only a free joint has its own origin; the parent determines other origins
             off = max(off, float(np.abs(t - expected[1]).max()))
         second = order[1] if len(order) == _ANGLES else None
         if off < _EXACT and joint.middle in (None, second):
@@ -147,7 +147,9 @@ def _candidate(
     # Translations move the origin by D q_t, and rotations by A c.
     D = np.stack([t[1 + k] - t[0] for k in shifts], axis=1)
     rows = [1 + k for k in order]
-    center = np.linalg.lstsq((A[rows] - A[0]).reshape(-1, 3), (t[rows] - t[0]).ravel())[0]
+    center = np.linalg.lstsq((A[rows] - A[0]).reshape(-1, 3), (t[rows] - t[0]).ravel(), rcond=None)[
+        0
+    ]
     if abs(np.linalg.det(D)) < _EXACT:
         return None
     start = t[0] - A[0] @ center

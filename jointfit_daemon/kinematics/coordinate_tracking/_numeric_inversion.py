@@ -22,7 +22,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chain_coordinates import JointCoordinates
 
 STEPS_PER_JOINT = 2
-"""Number of steps per instant for a joint whose coordinates at the preceding instant are known."""
+"""Number of steps per instant for each joint. It is sufficient if the coordinates at the preceding
+instant are known.
+"""
 SPARE_STEPS = 6
 """Number of additional steps per instant, for joints that move fast or have unknown coordinates."""
 _DIFFERENCE = 1e-5

@@ -177,7 +177,7 @@ class CoordinateTracker:
 
 
 class _Rotations(NamedTuple):
-    """Arrays over the J joints of three rotations that have a closed form."""
+    """Arrays for the J joints that have three rotations with a closed form."""
 
     rows: NDArray[np.intp]
     """Indices of the rotation angles among the coordinates, shape (J, 3)."""
@@ -223,7 +223,7 @@ class _Shift(NamedTuple):
     inverse: Array
     start: Array
     center: Array | None
-    """Joint center; None is zero."""
+    """Joint center in segment axes, m; None if it is zero."""
 
     @classmethod
     def of(

@@ -89,13 +89,14 @@ class Band:
 
 
 def limits_of(model: ChainModel, weight: float) -> tuple[Band, ...]:
-    """Return the band of the model's joint limits; empty without limits or weight."""
+    """Return the band of the model's joint limits; empty without limits or if the weight is 0."""
     joints = [s.joint for s in model.segments]
     low, high = np.full(model.nq, -np.inf), np.full(model.nq, np.inf)
     for joint, columns in zip(joints, model.columns, strict=True):
         if joint.kind in ("hinge", "coupled") and joint.limits is not None:
             low[columns], high[columns] = joint.limits
-    for _, column, curve in layout_of(model).coupled:  # relative to rest, like hinge angles
+    # Coordinates of coupled joints are made relative to the rest state, like hinge angles.
+    for _, column, curve in layout_of(model).coupled:
         low[column], high[column] = low[column] - curve.home, high[column] - curve.home
     limited = np.isfinite(low) | np.isfinite(high)
     if weight == 0.0 or not limited.any():

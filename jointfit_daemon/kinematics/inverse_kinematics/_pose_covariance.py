@@ -39,7 +39,8 @@ def pose_covariance(model: ChainModel, found: IkResult) -> tuple[Array, NDArray[
     Returns
     -------
     covariance
-        Covariance of a step from the true state, rad^2 and m^2, shape (T, nq, nq).
+        Covariance of the step from the true state to the estimate, rad^2 and m^2, shape (T, nq,
+        nq).
     determined
         Mask, shape (T, nq). It is False if the information about a degree of freedom, while all
         other degrees of freedom are free, is less than the information of one marker 2 cm from its

@@ -107,7 +107,7 @@ class LivePose:
     residuals: Array
     """Marker position of the model minus measured position, m, shape (M, 3); NaN where missing."""
     covariance: Array
-    """Covariance of the step from the true state, rad^2 and m^2, shape (nq, nq)."""
+    """Covariance of the step from the true state to the estimate, rad^2 and m^2, shape (nq, nq)."""
     determined: NDArray[np.bool_]
     """Mask of the degrees of freedom that the markers determine, shape (nq,). The information about
     such a degree of freedom, while all others are free, is at least the information of one marker
@@ -143,8 +143,8 @@ class LiveInverseKinematics:
         self._fed = 0
         self._restarted_at = 0
         self._patience = 1
-        """Number of restart intervals to wait. Every restart without improvement doubles this
-        number.
+        """Number of restart intervals to wait. It is doubled by every restart after which the chain
+        still does not fit its markers.
         """
         self._learned = 0
         self._still = np.zeros(model.nq)

@@ -101,7 +101,7 @@ class LslOutlet:
         joints.push_sample(_joint_values(output.joints), at_s)
 
     def _open(self, contents: str, channels: _Channels) -> Any:
-        """Return the outlet of a stream, with channels described as in motion capture."""
+        """Return the outlet of a stream, with the channel metadata of motion-capture streams."""
         info = self._lsl.StreamInfo(
             f"{self._name} {contents}",
             "MoCap",

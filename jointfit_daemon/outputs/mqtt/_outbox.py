@@ -135,7 +135,7 @@ class Outbox:
         self._push(self._streams, _STREAM_CAPACITY, message)
 
     def late(self, topic: str, payload: bytes) -> None:
-        """Add a message of an earlier outage, with QoS 1; the caller limits their number."""
+        """Add a message of an earlier outage, with QoS 1; the caller limits how many wait."""
         self._late.append((math.inf, Outgoing(topic, payload, 1, False)))
         self._wake.set()
 

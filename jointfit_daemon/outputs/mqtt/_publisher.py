@@ -184,7 +184,7 @@ class MqttPublisher:
         delay_s = _FIRST_RETRY_S
         while True:
             began_s = self._loop.time()
-            # see `_serve` for the reason
+            # Each connection has its own task; `_serve` states the reason.
             attempt = asyncio.create_task(self._serve(), name="mqtt connection")
             reason = ""
             try:

@@ -30,7 +30,7 @@ class RequestKeyError(Exception):
 
 
 def password_of(settings: MqttSettings) -> str | None:
-    """Return the password from `password_file` or the systemd credential; None without a source."""
+    """Return the password from `password_file` or the systemd credential; None if there is none."""
     path = _password_path(settings)
     if path is None:
         return None

@@ -86,7 +86,7 @@ def tls_remedy(
     established
         Whether the client completed its part of the handshake. TLS 1.3 checks the client's
         certificate last. If the broker closes the connection afterwards, it rejected this
-        certificate, and the reset of the connection loses the alert.
+        certificate. The client does not receive the broker's alert if the connection is reset.
     """
     if isinstance(error, ssl.SSLCertVerificationError):
         return f" ({_verification_remedy(error.verify_code, settings)})"
@@ -127,5 +127,5 @@ def _rejection_remedy(settings: MqttSettings) -> str:
         return "the broker requires a client certificate: set cert and key in [mqtt.tls]"
     return (
         f"the broker does not accept {settings.tls.cert}: check that it has not expired, and that "
-        "the broker's cafile contains its authority"
+        "the broker's cafile contains the authority that signed it"
     )

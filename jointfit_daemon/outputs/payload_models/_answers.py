@@ -107,10 +107,12 @@ class RecordAnswer(Table):
     """Answer to ``record``."""
 
     directory: str
-    file: str = Field(description="name of the open file, else of the last one; or empty")
+    file: str = Field(
+        description="name of the open or, if none is open, of the last file; may be empty"
+    )
     duration_s: float = Field(description="from the start of the recording to now, or to its end")
     written_bytes: int
-    lost: int = Field(description="messages that the disk did not take")
+    lost: int = Field(description="messages lost because they were not written")
     failure: str | None = Field(description="why the recording is interrupted")
     free_bytes: int | None = Field(description="free space for recordings")
     active: bool
@@ -121,7 +123,9 @@ class PhysicalTestOutcome(Table):
 
     id: str
     agrees: bool = Field(description="whether world, axes and direction are as configured")
-    deviations_deg: list[float] = Field(description="of each rotation from the one asked for")
+    deviations_deg: list[float] = Field(
+        description="angle of each measured rotation from the requested one"
+    )
     found: str = Field(description="convention of the quaternions as received, in words")
     rig_toml: list[str] = Field(description="lines of its [[imu]] table that correct the reading")
     alternatives: list[str] = Field(description="other lines, with another heading")

@@ -155,7 +155,7 @@ class Latency(Table):
     fused_us: Delays | None
     encoded_us: Delays | None
     written_us: Delays | None
-    total_us: Delays | None = Field(description="from the arrival of the last chunk to written")
+    total_us: Delays | None = Field(description="all stages together")
 
 
 class StateFaults(Table):

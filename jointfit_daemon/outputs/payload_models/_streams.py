@@ -78,7 +78,7 @@ class PoseJoint(AnglesAndRates):
 class Pose(Payload):
     """``pose`` and ``pose/ui``."""
 
-    seq: int = Field(description="counts frames at the source without gaps")
+    seq: int = Field(description="number of the frame; the source skips no number")
     t_us: Time
     completed_us: Time
     mono_us: int

@@ -304,7 +304,9 @@ def _info(rig: Rig) -> dict[str, Any]:
     """Return the payload of ``bridge/info``."""
     config = orjson.dumps(rig.table, str, orjson.OPT_SORT_KEYS)
     if any(source.kind == "mocap" for source in rig.sources):
-        world = "z up; x, y and origin of the motion capture, once calibrated with it; metres"
+        world = (
+            "z up; x, y and origin of the motion-capture system after a calibration with it; metres"
+        )
     else:
         world = "z up; x east and y north, where the sensors know north; metres"
     return {

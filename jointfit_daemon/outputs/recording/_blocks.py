@@ -206,7 +206,7 @@ _MESSAGE_INDEX = struct.Struct("<BQHI")
 
 
 def _starts_message_index(start: bytes) -> bool:
-    """Return whether the two lengths in a message index agree, because it has no checksum."""
+    """Return whether the two lengths in a message index agree; the record has no checksum."""
     if len(start) < _MESSAGE_INDEX.size:
         return False
     opcode, length, _, entries_bytes = _MESSAGE_INDEX.unpack_from(start)

@@ -104,8 +104,8 @@ def channel_form(channel: str) -> ChannelForm:
 
 _CLOCK = {"clock": "CLOCK_MONOTONIC of the host plus unix_offset_ns of the file"}
 _CHUNK_STAMP = (
-    "log_time: arrival at the host, on a serial line of the first byte; "
-    "publish_time: the same, the instant of the samples is known to the decoder only"
+    "log_time: arrival at the host; for a serial line, arrival of the first byte; "
+    "publish_time: equal to log_time, because only the decoder knows the instants of the samples"
 )
 _PROCESSED = "log_time: arrival of the event that was being processed; publish_time: its own stamp"
 _STAMPS = {

@@ -138,7 +138,7 @@ def _event(kind: str, given: dict[str, Any]) -> UnchunkedEvent:
 
 def _to_json(value: object) -> object:
     # Named tuples are converted first, because orjson does not support them. A limb state contains
-    # ten.
+    # ten named tuples.
     if isinstance(value, tuple):
         names: tuple[str, ...] | None = getattr(value, "_fields", None)
         return list(value) if names is None else dict(zip(names, value, strict=True))

@@ -1,4 +1,4 @@
-"""Delivery of events and decimated poses after the end of a broker outage, also after a restart.
+"""Delivery of events and decimated poses after a broker outage, even if the daemon restarts.
 
 While the daemon is connected, only the messages of the last seconds are stored, in memory. They are
 needed because a loss of the connection is detected late, and messages that were sent before the
@@ -148,7 +148,7 @@ class Spool:
         )
 
     async def run(self) -> None:
-        """Write and deliver messages until cancelled, then write the rest of an outage."""
+        """Write and deliver messages until cancelled; then write those of a current outage."""
         await self._with_files(self._files.load)
         try:
             async with asyncio.TaskGroup() as tasks:

@@ -368,7 +368,7 @@ class CalibrationSession:
             self._static_s = recording.wanted_s
 
         self._jobs += 1
-        self.refits.job = None  # The only worker drops a running refit in favour of this fit.
+        self.refits.job = None  # The single worker stops a running refit for this fit.
         self._fit = FitJob(self._jobs, self._job(phase, recording.trial(now_ns)))
 
         outputs: list[Output] = []

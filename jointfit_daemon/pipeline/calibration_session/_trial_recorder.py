@@ -20,7 +20,7 @@ _MAX_SAMPLES = MAX_PHASE_S * 400
 
 @dataclass(slots=True)
 class TrialRecorder:
-    """Records samples and mocap frames, starting with its creation.
+    """Stores the samples and mocap frames of one calibration phase.
 
     Invariant: the times of each track in a trial increase strictly.
     """

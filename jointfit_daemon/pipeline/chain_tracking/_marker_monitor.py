@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 FAR_M = 0.06
 """Distance from the model position above which a marker is misplaced, m. Soft-tissue artefact is
-smaller, and 0.04 m is accepted."""
+smaller, and so is the largest accepted marker error, 0.04 m."""
 NEAR_M = 0.03
 """Distance from the model position below which a faulty marker can recover, m."""
 FAULT_NS = 1_000_000_000

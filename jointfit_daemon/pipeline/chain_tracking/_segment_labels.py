@@ -1,9 +1,9 @@
 """Search for exchanged labels by the shapes of the segments of a chain model.
 
-Inverse kinematics rotates the last segment of a chain until its exchanged markers fit best. The
-exchanged markers are then near the model positions of other markers, or only some markers are far
-from their own model positions. The shape of the segment's marker cluster is not affected, so
-exchanged labels can be found from it.
+If markers on the last segment of a chain are exchanged, inverse kinematics rotates this segment
+until they fit best. In this wrong pose, other markers seem to be exchanged, or only some markers
+have large errors. The shape of the segment's marker cluster does not depend on the pose, so the
+search compares shapes.
 
 Invariant: the computation per frame is limited, so a search takes several frames. The last result
 is valid until the next result.
@@ -108,7 +108,10 @@ class SegmentLabels:
         )
 
     def fit(self, markers: Iterable[int]) -> bool:
-        """Return whether the segments of the given markers fitted in the last examined frame."""
+        """Return whether, in the last result, the segments of these markers fit.
+
+        A marker that was found exchanged does not fit.
+        """
         parts = {self._segments[m] for m in markers}
         rms = [self._rms[self._names.index(part)] for part in parts if part in self._names]
         exchanged = {m for fault in self.faults for m in fault}

@@ -217,12 +217,10 @@ class OnlineFrameCollector:
             {name: x for name, x in mocap.items() if name in bodies},
         )
 
-    # --- mocap names -------------------------------------------------------------------------
-
     # --- pairs -------------------------------------------------------------------------------
 
     def _pair(self, t_ns: int, mocap: list[Array]) -> None:
-        """Retain the sensors at the instant of a mocap frame, if all are known and have moved."""
+        """Pair a mocap frame with the sensors at its instant, and retain the pair if it is due."""
         after = None
         for before in reversed(self._frames):
             if before.t_ns <= t_ns:
@@ -258,7 +256,10 @@ class OnlineFrameCollector:
     def _sensors_at(
         self, t_ns: int, before: AlignedFrame, after: AlignedFrame
     ) -> list[Quaternion] | None:
-        """Return the sensors between two frames; None if data or synchronization is missing."""
+        """Return the segment orientations from all sensors, interpolated between two frames.
+
+        The result is None if data or synchronization is missing, or the frames are too far apart.
+        """
         width = after.t_ns - before.t_ns
         if width > MAX_GAP_NS or not (before.synced and after.synced):
             return None

@@ -100,7 +100,7 @@ class _Joint:
 
 
 class PlanarTracker:
-    """Estimates the joints between body parts, one of which has at least two markers.
+    """Estimates each joint between two body parts of which at least one has two or more markers.
 
     Parameters
     ----------

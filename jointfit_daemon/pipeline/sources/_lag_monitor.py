@@ -40,7 +40,8 @@ WINDOW_NS = 10_000_000_000
 HOP_NS = 2_500_000_000
 """Time between the starts of successive windows, ns."""
 MARGIN_NS = 300_000_000
-"""Duration of samples before and after the window, ns, for the lag and the ends of the filter."""
+"""Time before and after the window whose samples are also used, ns: for the lag, and for the filter
+at the ends of the window."""
 DRIFT_FAULT = 2e-6
 """Drift of the lag between two synchronized clocks, ns/ns. A larger drift means that a clock fit is
 wrong."""
@@ -57,7 +58,7 @@ _FRAMES_PER_STEP = 150
 _MIN_FRAMES = 100
 
 
-_LOW_R2 = "no lag from this movement; normal on soft tissue, the lag in force stays"
+_LOW_R2 = "no lag from this movement: normal on soft tissue, the lag in use is not changed"
 """Text for a low coefficient of determination R² during tracking. The cause is motion of the sensor
 on the skin, which is not a fault."""
 

@@ -173,7 +173,7 @@ class FrameAligner:
 
     @property
     def next_ns(self) -> int | None:
-        """Instant of the next frame, ns; None before the first frame."""
+        """Instant of the next frame, ns; None while the instant of the first frame is unknown."""
         return None if self._next is None else self._next * self._period_ns
 
     def advance(self, now_ns: int, *, complete_only: bool = False) -> list[AlignedFrame]:

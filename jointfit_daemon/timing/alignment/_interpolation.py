@@ -43,9 +43,9 @@ class OrientationSample(Protocol):
 def interpolate_orientation(
     before: OrientationSample | None, a: OrientationSample, b: OrientationSample, t_ns: int
 ) -> Quaternion:
-    r"""Return the orientation at `t_ns`, between the neighbours `a` and `b`.
+    r"""Return the orientation at `t_ns`, between the neighbors `a` and `b`.
 
-    If both neighbours have rates, the result is a cubic Hermite interpolation in the tangent space
+    If both neighbors have rates, the result is a cubic Hermite interpolation in the tangent space
     of `a`. Without rates, but with a sample `before`, the result is the parabola through the three
     samples,
 

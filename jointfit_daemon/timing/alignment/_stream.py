@@ -46,7 +46,7 @@ _EARLY = 20
 period before the frame. Jitter may place this sample after the frame.
 """
 _DELAY_STEP = 128
-"""The usual delay changes by 1/128 period per sample."""
+"""The usual delay decreases by at most 1/128 period per sample."""
 _DELAY_UP = 3
 """Ratio of an increase to a decrease of the usual delay. With the ratio 3 the usual delay converges
 to the 75th percentile of the delays.

@@ -36,12 +36,13 @@ _SILENCE_LEAST_NS = 500_000_000
 delays.
 """
 _SILENCE_SHARE = 0.1
-"""Largest difference of device time and host time over a silence, share of the silence."""
+"""Largest difference of device time and host time over a silence, as a fraction of the silence."""
 _BACKLOG_NS = 100_000_000
 """Least delay of a backlog, ns, and tolerance of the first sample after the backlog."""
 _WRAP_SLACK = 8
-"""Largest accepted difference, counts, of a wrap from the elapsed time while the counter width is
-unknown."""
+"""Largest accepted difference, counts, between the change of the counter and the elapsed time at
+the first wrap. If a quarter of the elapsed time is larger, it is the limit.
+"""
 _LATE = 0.65
 """Delay from which a sample counts as late, periods."""
 _DOUBTFUL = 0.35
@@ -55,9 +56,13 @@ _LATE_SHARE_GAIN = 0.02
 _LATE_SHARE_FIRST = 0.2
 """Initial share of late samples."""
 _LATE_SHARE_LEAST = 0.03
-"""Least share of late samples, with which at least 4 late samples in a row count as a loss."""
+"""Lower bound of the share of late samples. With this share, 4 late samples in a row count as a
+loss.
+"""
 _LATE_SHARE_MOST = 0.65
-"""Largest share of late samples, with which at most 32 late samples in a row count as a loss."""
+"""Upper bound of the share of late samples. With this share, 33 late samples in a row count as a
+loss.
+"""
 _LATE_LOG_CHANCE = -14.0
 """Natural logarithm of a probability, about one in a million. If a run of late samples is less
 probable by chance, samples count as lost.
@@ -114,7 +119,7 @@ class TickTime:
         return self._turn_ns
 
     def forget_counter(self) -> None:
-        """Skip the next counter check, because devices do not count samples while configured."""
+        """Skip the next counter check; during its configuration a device does not count samples."""
         self._counter = None
 
     def to_ns(self, ticks: int) -> int:
@@ -123,7 +128,7 @@ class TickTime:
         return ticks * self._clock.tick_ns if rate is None else ticks * NS_PER_S // rate
 
     def echo_ns(self, ticks: int) -> int:
-        """Return the device time of an echo, ns, on the turn nearest to the last sample."""
+        """Return the device time of an echo, ns, in the tick cycle nearest to the last sample."""
         last = ticks if self._last is None else self._last
         return self.to_ns(unwrap(ticks, last, self._clock.modulus, 0, self._turn_ns))
 

@@ -44,7 +44,7 @@ _SPACING_NS = 500_000_000
 _STRAY_NS = 500_000
 """Residual above which an edge is an outlier, ns."""
 _STRAYS = 5
-"""Outliers in a row that invalidate the fit."""
+"""Number of successive outliers that invalidates the fit."""
 
 
 class HostTime(Protocol):
@@ -71,7 +71,7 @@ class DeclaredOffset(NamedTuple):
     """A device clock that differs from the host clock by a known offset."""
 
     offset_ns: int
-    """Host time minus device time."""
+    """Host time minus device time, ns."""
     slope: float = 0.0
 
     def usable(self, u: int) -> bool:  # noqa: ARG002 - the offset is constant

@@ -24,7 +24,9 @@ LATE_FOR_NS = 2_000_000_000
 LATE_SIGMAS = 20.0
 """Least delay that counts as late, in standard deviations of the clock estimate."""
 INTERVALS = 4
-"""Number of intervals of `LATE_FOR_NS`. The delays of their fastest samples must agree."""
+"""Number of intervals into which `LATE_FOR_NS` is divided. The delays of the fastest samples of the
+intervals must agree.
+"""
 JITTER_NS = 25_000_000
 """Largest mean delay above the fastest samples, ns, that a paused clock explains."""
 EARLY_SAMPLES = 3

@@ -62,7 +62,7 @@ class Rates:
 def rates_from_orientations(
     t_ns: NDArray[np.int64], q: Floats, origin_ns: int, *, bridge_s: float = BRIDGE_S
 ) -> Rates:
-    r"""Return the body rate between neighbouring poses.
+    r"""Return the body rate between neighboring poses.
 
     .. math:: \omega_{k+1/2} = \frac{\log(q_k^* q_{k+1})}{t_{k+1} - t_k},
               \quad t_{k+1/2} = \frac{t_k + t_{k+1}}{2}

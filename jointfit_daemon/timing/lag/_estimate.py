@@ -137,7 +137,7 @@ def estimate_lag(
     turned = rates(ref_t_ns, rotation.conjugate(ref_q))
     if estimate_lag_of_rates(imu, turned, settings).refused is not None:
         return estimate
-    hint = f"{estimate.refused}; the fit succeeds with one side's quaternions conjugated"
+    hint = f"{estimate.refused}; the fit succeeds if the quaternions of one system are conjugated"
     return replace(estimate, refused=hint)
 
 
@@ -146,7 +146,7 @@ def estimate_lag_of_rates(
 ) -> LagEstimate:
     """Estimate the lag between two tracks of angular rates with a common origin.
 
-    Parameters as in ``estimate_lag``.
+    `settings` has the same meaning as in ``estimate_lag``.
     """
     work = estimate_in_steps(imu, ref, settings)
     while True:

@@ -115,7 +115,7 @@ def fit_fault(
         ),
         (
             sigma_ns <= settings.max_sigma_ns,
-            f"too uncertain: {_ms(sigma_ns)} > {_ms(settings.max_sigma_ns)}: {_MOVE_IRREGULARLY}",
+            f"too uncertain: {_sd_text(sigma_ns, settings.max_sigma_ns)}: {_MOVE_IRREGULARLY}",
         ),
         (
             abs(fit.tau_s) <= settings.span_s,
@@ -130,5 +130,7 @@ def fit_fault(
     return f"the motion is periodic: a lag of {other_ms:.0f} ms fits as well; {_MOVE_IRREGULARLY}"
 
 
-def _ms(value_ns: float) -> str:
-    return f"{value_ns * 1e-6:.2f} ms" if value_ns < inf else "only one moment determines it"
+def _sd_text(sigma_ns: float, most_ns: float) -> str:
+    if sigma_ns < inf:
+        return f"{sigma_ns * 1e-6:.2f} ms > {most_ns * 1e-6:.2f} ms"
+    return "only one moment of the movement determines the lag"

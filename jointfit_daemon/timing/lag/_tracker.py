@@ -61,7 +61,7 @@ class LagTracker:
         self._refused: list[float] = []
 
     def feed(self, t_ns: int, estimate: LagEstimate) -> TrackedLag | None:
-        """Add the estimate of a window centred at `t_ns`; return the tracked lag.
+        """Add the estimate of a window centered at `t_ns`; return the tracked lag.
 
         A rejected estimate only advances the time. The result is None before the first accepted
         estimate.

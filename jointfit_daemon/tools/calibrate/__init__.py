@@ -1,4 +1,4 @@
-"""Command `jointfit calibrate`: guides a functional calibration of a running daemon over MQTT."""
+"""Command `jointfit calibrate`: guides the calibration of a running daemon over MQTT."""
 
 from jointfit_daemon.tools.calibrate._command import calibrate
 from jointfit_daemon.tools.calibrate._offline import store_offline_calibration

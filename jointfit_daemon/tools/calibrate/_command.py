@@ -1,8 +1,8 @@
 """Command `jointfit calibrate`: requests calibration phases over MQTT and reports their result.
 
 Invariants: only the result is written to stdout; prompts, progress and warnings are written to
-stderr. If this command is stopped during a phase that it started, it aborts the phase before it
-ends, provided that the broker and the daemon are reachable.
+stderr. If the command is stopped during a phase that it started, it first aborts this phase,
+provided that the broker and the daemon are reachable.
 """
 
 from __future__ import annotations

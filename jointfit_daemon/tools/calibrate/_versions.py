@@ -58,7 +58,7 @@ def _note(version: Mapping[str, Any]) -> str:
     if version["fault"]:
         return str(version["fault"])
     if not version["usable"]:
-        return "of another limb or other sensors"
+        return "made for another limb or other sensors"
     notes = [f"copy of version {version['restored_from']}"] if version["restored_from"] else []
     if (online := version["online"]) is not None:
         notes.append(f"online learning, round {online['rounds']}")

@@ -71,14 +71,13 @@ def calibrate_sensor(
 ) -> None:
     """Calibrate the raw readings of one sensor by guided movements; the daemon must be stopped.
 
-    Estimates the bias of the gyroscope at rest; bias, scale and axes of the accelerometer from
-    static poses; scale and axes of the gyroscope from the turns between these poses; and hard and
-    soft iron of the magnetometer from free rotation. Each step ends by itself. The result is
-    written into
-    the table imu.sensor_calibration of rig.toml, which the daemon uses from its next start or
-    reload. Exit codes: 0 all steps have a result; 1 the sensor is lost, or a step was refused (the
-    results of the others are written); 2 invalid options or rig.toml; 128 + N stopped by signal N,
-    nothing was written.
+    The command estimates the bias of the gyroscope at rest; bias, scale and axes of the
+    accelerometer from static poses; scale and axes of the gyroscope from the turns between these
+    poses; and hard and soft iron of the magnetometer from free rotation. Each step ends by itself.
+    The result is written into the table imu.sensor_calibration of rig.toml, which the daemon uses
+    from its next start or reload. Exit codes: 0 all steps have a result; 1 the sensor is lost, or a
+    step was refused (the results of the others are written); 2 invalid options or rig.toml; 128 + N
+    stopped by signal N, nothing was written.
     """
     from jointfit_daemon.config import load_rig
     from jointfit_daemon.tools.text_output import echo_json, echo_wrapped

@@ -50,8 +50,8 @@ def _lines(estimate: Estimate) -> list[str]:
         return [
             f"  gyroscope scale: errors {_numbers(scales, 2)} %, standard deviation "
             f"{scale_sd:.2f}{'' if np.isnan(estimate.matrix_sd[0, 1]) else axes}",
-            f"    {estimate.turns} turns, {np.rad2deg(estimate.angle):.0f} deg in all, end "
-            f"{np.rad2deg(estimate.spread_before):.2f} deg (RMS) from gravity before, "
+            f"    {estimate.turns} turns, {np.rad2deg(estimate.angle):.0f} deg in all; direction "
+            f"of gravity wrong by {np.rad2deg(estimate.spread_before):.2f} deg (RMS) before, "
             f"{np.rad2deg(estimate.residual):.2f} after",
         ]
     if isinstance(estimate, AccelerometerEstimate):

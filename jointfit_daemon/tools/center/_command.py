@@ -28,7 +28,8 @@ _Segments = Annotated[
     list[str] | None,
     typer.Option(
         "--segment",
-        help="Instead: markers of a segment, repeated from one end of a chain to the other.",
+        help="Markers of one segment of a chain, instead of --parent and --markers; repeat the"
+        " option from one end of the chain to the other.",
     ),
 ]
 _Joints = Annotated[str | None, typer.Option("--joints", help="Names of the joints of the chain.")]

@@ -158,7 +158,7 @@ def mm(metres: float) -> str:
 
 
 def number(value: float) -> str:
-    """Return a number with three digits."""
+    """Return a number with three significant digits."""
     return "∞" if value == inf else f"{value:.3g}"
 
 

@@ -240,8 +240,8 @@ def _reduce_planar(seen: Array, child: Array, basis: Array, interval: float) -> 
     z = flat[..., 0] + 1j * flat[..., 1]
     whole = np.flatnonzero(np.isfinite(z).all(axis=1))
     middle = z.mean(axis=1)
-    # Template: median over the frames after the second marker is rotated onto the x axis of the
-    # first
+    # The template is the median of all complete frames, each rotated so that the second marker lies
+    # on the x axis through the first marker.
     turned = (z - middle[:, None]) * np.exp(-1j * np.angle(z[:, 1] - z[:, 0]))[:, None]
     template = np.median(turned[whole].real, axis=0) + 1j * np.median(turned[whole].imag, axis=0)
     template -= template.mean()

@@ -84,7 +84,7 @@ def tables(setup: StudySetup, study: Sequence[PairMaps], more: StudyExtension) -
         f"Repetition of small angles: median error, mm, after averaging {setup.repeats} repetitions"
         f" at r = {setup.radius:g} m and σ = {MM_PER_M * setup.noise:g} mm",
         _indent_table(repetition),
-        "Effect of the radius: 95th percentile of the error over that at"
+        "Effect of the radius: 95th percentile of the error, divided by that at"
         f" r = {100 * setup.radii[-1]:g} cm, α = {np.rad2deg(setup.step):.0f}°,"
         f" σ = {MM_PER_M * LARGE_NOISE_M:g} mm",
         _indent_table(

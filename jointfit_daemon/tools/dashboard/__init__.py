@@ -11,7 +11,7 @@ __all__ = ["dashboard"]
 
 
 def __getattr__(name: str) -> Any:
-    """Return the command; the import on demand lets the server run without it."""
+    """Return the command. It is imported on demand, so that the server runs without this import."""
     if name != "dashboard":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from jointfit_daemon.tools.dashboard._command import dashboard

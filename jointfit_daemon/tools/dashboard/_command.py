@@ -59,7 +59,7 @@ def dashboard(
     from jointfit_daemon.tools.dashboard._certificates import broker_context, page_context
     from jointfit_daemon.tools.dashboard.server import open_listener
 
-    broker_context(target, ca), page_context(certificate, key)  # this call reports invalid files
+    broker_context(target, ca), page_context(certificate, key)  # reports invalid files
     rig = None if set_up is None else _new_rig(set_up, address)
     listener = open_listener(address)
     listener.set_inheritable(True)

@@ -83,7 +83,7 @@ def parse_broker(text: str, account: str = "the page asks for them") -> BrokerAd
     Raises
     ------
     ValueError
-        `text` has none of these forms, or contains a password.
+        `text` has none of these forms, or contains a user name or password.
     """
     expected = (
         f"--broker {text}: expected mqtt://HOST:PORT, mqtts://HOST:PORT (TLS), or wss://HOST/PATH"

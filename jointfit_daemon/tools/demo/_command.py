@@ -34,7 +34,7 @@ BASE = "jointfit/demo"
 
 def demo(
     *,
-    seconds: Annotated[float, typer.Option(help="Live time after the calibration, s.")] = 30.0,
+    seconds: Annotated[float, typer.Option(help="Run time after the calibration, s.")] = 30.0,
     headless: Annotated[
         bool, typer.Option("--headless", help="No display; print the result as one JSON line.")
     ] = False,

@@ -42,7 +42,7 @@ ATTEMPTS = 3
 """Number of attempts at each phase. A busy computer delays the simulated sensors, which aborts the
 phase."""
 STOPPED_BY_USER = "abort requested"
-"""Last words of the reason if a user stopped the phase in the page."""
+"""End of the reason for an abort if a user stopped the phase in the page."""
 LIVE = "The limb is live. Calibrate again in the page; Ctrl-C stops."
 UNCALIBRATED = "The limb is not calibrated. Calibrate it in the page; Ctrl-C stops."
 
@@ -103,7 +103,11 @@ def print_address(url: str, listen: ListenAddress) -> None:
 
 
 async def _calibrate(rig: Rig, process: ChildProcess) -> str:
-    """Run all phases unless the user controls them in the page; return the result as text."""
+    """Run the phases in order, and return the result as text.
+
+    The first phase that is refused or aborted is the last one, for example because the user
+    controls the phases in the page.
+    """
     from jointfit_daemon.outputs.mqtt import MqttClient
 
     online: set[str] = set()

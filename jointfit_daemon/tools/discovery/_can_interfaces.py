@@ -115,7 +115,7 @@ def find_can_interfaces(
 
 
 def _link_details(run: RunCommand, name: str) -> dict[str, Any]:
-    """Return the output of ``ip`` for an interface; empty if ``ip`` is not installed."""
+    """Return the output of ``ip`` for an interface; empty if ``ip`` is absent or prints no JSON."""
     text = run(["ip", "-details", "-json", "link", "show", "dev", name])
     try:
         links = orjson.loads(text or "[]")

@@ -20,7 +20,7 @@ _STORED_S = 1.0
 
 
 async def check_broker(settings: MqttSettings) -> list[Finding]:
-    """Return the findings about the broker; the connection uses its own client id."""
+    """Return the findings about the broker; the check has a client id of its own."""
     address = f"{settings.host}:{settings.tcp_port}"
     missing = missing_files(settings)
     findings = [

@@ -26,8 +26,8 @@ def check_can(host: Host, bitrates: Mapping[str, int | None] | None) -> Iterator
     host
         The host to check.
     bitrates
-        SocketCAN interfaces of rig.toml with their configured bit rates, bit/s. The default is all
-        interfaces of the host.
+        SocketCAN interfaces of rig.toml with their configured bit rates, bit/s. With None, all
+        interfaces of the host are checked.
     """
     found = {interface.name: interface for interface in find_can_interfaces(host.root, host.run)}
     if bitrates is None and not found:

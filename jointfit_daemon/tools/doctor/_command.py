@@ -34,11 +34,11 @@ def doctor(
 ) -> None:
     """Find the faults that keep data from the daemon, each with its remedy.
 
-    Checks permissions, other programs and latency of serial ports, CAN interfaces, clock, disk,
-    memory and processor; with a rig.toml also the broker, the family of the sensors on serial ports
-    by listening, and the cameras by a connection as the daemon makes it. Changes nothing, and needs
-    no root access. Exit codes: 0 no error, with
-    warnings or without; 1 an error; 2 invalid options or rig.toml.
+    The command checks serial ports (permissions, other programs, latency), CAN interfaces, clock,
+    disk, memory and processor. With a rig.toml, it also checks the broker, identifies the sensors
+    on serial ports from the data that they send, and connects to the cameras as the daemon does. It
+    changes nothing, and needs no root access. Exit codes: 0 no error (warnings are possible); 1 an
+    error; 2 invalid options or rig.toml.
     """
     from rich.console import Console
     from rich.progress import Progress

@@ -73,7 +73,7 @@ def _check(host: Host, source: Source) -> Finding:
         heard = listen_serial(str(host.at(port)), listen_s=_LISTEN_S, layouts=layouts)
     name = f"{source.id} ({port})"
     if heard.fault is not None:
-        return Finding(CHECK, name, "unknown", f"not listened to: {heard.fault}")
+        return Finding(CHECK, name, "unknown", f"not checked: {heard.fault}")
     if not any(heard.received_bytes.values()):
         return Finding(CHECK, name, "note", _SILENT)
     return _compare(source, table, name, heard)
@@ -87,8 +87,8 @@ def _compare(  # noqa: PLR0911 - one for each finding
     if not heard.devices:
         text = f"{sum(heard.received_bytes.values())} bytes, but no driver decodes them"
         remedy = (
-            "correct the port, or describe the data by a serial-table; for a table of rig.toml, "
-            "`jointfitd` logs the setting that fits the data"
+            'correct the port, or describe the data with driver = "serial-table"; if rig.toml '
+            "has such a table, `jointfitd` logs the setting that fits the data"
         )
         return Finding(CHECK, name, "error", f"{text}, expected {expected}", remedy)
 
@@ -121,7 +121,7 @@ def _compare(  # noqa: PLR0911 - one for each finding
         said = said or "the daemon configures it when it opens the port"
         return Finding(CHECK, name, "note", f"{at} sends no orientation: {said}")
     if found.warnings:
-        remedy = "correct it as stated, then run this again"
+        remedy = "correct this, then run `jointfit doctor` again"
         return Finding(CHECK, name, "warning", f"{at}: {said}", remedy)
     rate = "" if found.rate_hz is None else f", {found.rate_hz:.1f} Hz"
     return Finding(CHECK, name, "ok", f"{at}{rate}")

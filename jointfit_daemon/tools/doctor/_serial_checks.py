@@ -64,7 +64,7 @@ def _check_port(host: Host, path: str, ports: Sequence[SerialPortInfo]) -> Itera
     holders = [] if is_pseudo else host.holders(node)
     for number, program in holders:
         if program.startswith(_DAEMON_NAMES):
-            text = f"in use by {program} (process {number}), as while the daemon runs"
+            text = f"in use by {program} (process {number}), as expected while the daemon runs"
             yield Finding(CHECK, path, "note", text)
         else:
             text = f"in use by {program} (process {number}), which reads its bytes or locks it"

@@ -94,7 +94,7 @@ def evaluate(
     markers: Markers = None,
     up: Up = "z",
     holdout: Annotated[
-        float, typer.Option("--holdout", min=0.1, max=0.9, help="Hold-out share of a single trial.")
+        float, typer.Option("--holdout", min=0.1, max=0.9, help="Held-out share of a single trial.")
     ] = 0.4,
     json: Json = False,
     plot: Annotated[

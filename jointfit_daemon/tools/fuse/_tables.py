@@ -34,7 +34,7 @@ seconds."""
 NORM_SLACK = 0.05
 """Largest accepted deviation of the median quaternion norm from 1."""
 FEWEST = 30
-"""Smallest number of common samples of sensors and reference."""
+"""Smallest number of rows of a recording, and of samples that sensors and reference share."""
 
 
 class UnusableInputError(ValueError):
@@ -66,7 +66,7 @@ def read_recording(path: Path, up: Axis) -> OrientationRecording:
     kind = path.suffix.lower()
     if kind == ".npz":
         trial = read_orientations_npz(path)
-        for name, array in read_arrays(path).items():  # `_trial.py` normalizes them
+        for name, array in read_arrays(path).items():  # `trial` contains them normalized
             if name.endswith("_quat") or name.startswith("q_"):
                 check_unit_norm(path, name, np.asarray(array, dtype=np.float64))
         table = OrientationRecording(trial.t_s, trial.sensors, trial.bones, trial.origins)

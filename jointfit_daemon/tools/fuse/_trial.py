@@ -264,7 +264,7 @@ def _check_stillness(path: Path, found: Mapping[str, RobustMean]) -> None:
 
 
 def read_mounts(path: Path, chain: Chain) -> dict[str, Array]:
-    """Read sensor alignments from a JSON file ``{"q_bias": {SENSOR: [w, x, y, z]}, "up": "y"}``."""
+    """Read sensor alignments from JSON, ``{"q_bias": {SENSOR: [w, x, y, z]}, "up": "y"}``."""
     from jointfit_daemon.files.text import MalformedFileError, read_json
 
     try:

@@ -35,7 +35,9 @@ def init(
     ] = None,
     answers: Annotated[
         Path | None,
-        typer.Option("--answers", help="TOML file with answers; a missing answer is the proposal."),
+        typer.Option(
+            "--answers", help="TOML file with answers; the proposal replaces a missing one."
+        ),
     ] = None,
     port: Annotated[
         list[Path] | None,
@@ -84,7 +86,7 @@ def init(
 
 def _show_result(written: WrittenRig) -> None:
     if written.open_places:
-        echo_wrapped(f"\n{written.path} is written. These places are not filled in yet:")
+        echo_wrapped(f"\n{written.path} is written. These values are still missing:")
         for place in written.open_places:
             echo_wrapped(f"  {place}")
     else:

@@ -165,7 +165,7 @@ QUESTIONS: tuple[Question, ...] = (
         "sensor_rate_hz",
         "number",
         "Samples per second of each sensor (Hz)",
-        "Rate to which the sensors are set. At least the rate of the poses is best.",
+        "Rate to which the sensors are set. Choose at least the rate of the poses.",
         subjects=_if(_has_sensors),
         default=_proposals.sensor_rate,
     ),
@@ -200,8 +200,8 @@ QUESTIONS: tuple[Question, ...] = (
         "device",
         "Connection of the sensor {subject}",
         "A number of the list, the path of a serial port, or a CAN interface. 'find' detects the"
-        " sensor by its movement: it opens the free ports and buses of the list. 'later' leaves"
-        " the place open until the sensor is connected.",
+        " sensor by its movement: it opens the free ports and buses of the list. If it is"
+        " not connected yet, answer 'later': rig.toml then contains this word.",
         group="sensor",
         postponable=True,
         subjects=_sensors,
@@ -345,7 +345,8 @@ QUESTIONS: tuple[Question, ...] = (
         "plate",
         "text",
         "Rigid body of the plate for the align phase",
-        "Name in the stream of the plate that carries all sensors once per laboratory. Answer"
+        "Name, in the stream, of the plate to which all sensors are fastened in the align phase,"
+        " which is needed once per laboratory. Answer"
         " 'later' if it is not known yet.",
         postponable=True,
         subjects=_if(lambda answers: _has_sensors(answers) and has_cameras(answers)),

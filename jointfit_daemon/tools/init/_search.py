@@ -117,7 +117,7 @@ def _with_identifiers(
 ) -> ImuDriver:
     """Return `about` with the sensors that the driver can recognize on a CAN bus.
 
-    The simulated bus carries every 11-bit identifier, so the driver proposes all possible sensors.
+    The driver proposes sensors for a simulated bus on which every 11-bit identifier was received.
     """
     names = tuple(getattr(fields["ids"].annotation, "model_fields", ()))
     propose = getattr(driver, "candidate_tables", None)
@@ -214,9 +214,11 @@ class DeviceSearch:
         if traffic.fault is not None:
             raise AnswerError(traffic.fault)
         if not any(traffic.received_bytes.values()):
-            raise AnswerError(f"{port} is silent: check the power of the sensor, or choose one")
+            raise AnswerError(
+                f"{port} is silent: check the power of the sensor, or choose a driver"
+            )
         if not traffic.devices or traffic.baud is None:
-            raise AnswerError(f"{port}: no driver decodes its data: choose from the list")
+            raise AnswerError(f"{port}: no driver decodes its data: choose a driver of the list")
         device = traffic.devices[0]
         known = replace(
             found,
@@ -321,7 +323,8 @@ class DeviceSearch:
         tables = self._tables(found, answers, choices)
         if not tables:
             raise AnswerError(
-                "nothing was found to listen to: connect the sensor, or name its port with --port"
+                "no free port and no CAN sensor was found: connect the sensor, or name its port"
+                " with --port"
             )
 
         self.show(f"  Opening {', '.join(tables)}; hold all sensors still …")

@@ -85,5 +85,5 @@ def write_rig(path: Path, given: Answers, found: Found) -> WrittenRig:
         command = f"jointfit init --config {name} --force"
         if path.name == "rig.toml":
             command = f"jointfit init {shlex.quote(str(path.parent))} --force"
-        following = {command: "fill in these places later"} | following
+        following = {command: "enter the missing values later"} | following
     return WrittenRig(path, table, tuple(open_places), tuple(rig_warnings(rig)), following)

@@ -58,13 +58,16 @@ Weights = Annotated[
 Evenness = Annotated[
     float,
     typer.Option(
-        "--evenness", min=0.0, max=8.0, help="Trial weight: this power of its error; 0: equal."
+        "--evenness", min=0.0, max=8.0, help="Weight of a trial: its error to this power."
     ),
 ]
 Holdout = Annotated[
     float,
     typer.Option(
-        "--holdout", min=0.0, max=0.5, help="Last share of each trial, for early stopping."
+        "--holdout",
+        min=0.0,
+        max=0.5,
+        help="Share at the end of each trial that decides when to stop.",
     ),
 ]
 Frames = Annotated[

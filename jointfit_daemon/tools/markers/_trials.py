@@ -47,7 +47,7 @@ def load(
     Raises
     ------
     ValueError
-        A name in a lock option is unknown. A damaged file raises `MalformedFileError`.
+        A name in an option is unknown. A damaged file raises the subclass `MalformedFileError`.
     """
     read = [read_marker_trial(path, cast("Axis | None", asked.up)) for path in trials]
     validations = [read_marker_trial(path, cast("Axis | None", asked.up)) for path in validation]

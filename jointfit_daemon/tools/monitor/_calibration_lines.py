@@ -145,7 +145,9 @@ def _result(calibration: CalibrationState, width: int) -> list[Line]:
         ValueError,
         AttributeError,
     ):  # format of another version
-        texts = ["The quality of this calibration cannot be read: it is of another version."]
+        texts = [
+            "The quality of this calibration cannot be read: its format is of another version."
+        ]
     for text in texts:
         lines += wrap(text, width, indent=2)
     still_s = _number(_table(quality.get("static")).get("still_s"))

@@ -37,7 +37,7 @@ _Rig = Annotated[
     Path | None,
     typer.Option(
         help="rig.toml with the broker, its account and the request key. Default: rig.toml of the"
-        " present folder, if there is one and no option of the broker."
+        " present folder, if it exists and no broker option is given."
     ),
 ]
 _Broker = Annotated[
@@ -55,7 +55,7 @@ _Ca = Annotated[
 _User = Annotated[str | None, typer.Option(help="User name for the broker.")]
 _PasswordFile = Annotated[Path | None, typer.Option(help="File with the password of --user.")]
 _KeyFile = Annotated[Path | None, typer.Option(help="File with the key that signs requests.")]
-_Rate = Annotated[float, typer.Option(help="Updates of the screen a second.", min=0.5, max=10.0)]
+_Rate = Annotated[float, typer.Option(help="Screen updates per second.", min=0.5, max=10.0)]
 _Ascii = Annotated[bool, typer.Option("--ascii", help="Use ASCII characters only.")]
 
 
@@ -74,13 +74,14 @@ def monitor(
     """Show limb, joint angles, sensors and calibration in a terminal, also over ssh.
 
     Keys are shown in the last line; q or Ctrl-C ends the monitor. It reconnects when the daemon or
-    the broker is lost, and states which. Colours follow NO_COLOR. Exit codes: 0 ended by a key; 2
-    invalid options or rig.toml, no terminal, or a missing package; 128 + N stopped by signal N.
+    the broker is lost, and shows which of them was lost. Colours follow NO_COLOR. Exit codes: 0
+    ended by a key; 2 invalid options or rig.toml, no terminal, or a missing package; 128 + N
+    stopped by signal N.
     """
     options = (broker, ca, user, password_file, request_key_file)
     if rig is not None and any(option is not None for option in options):
         raise ValueError(
-            "--rig and options of the broker: expected one of them; rig.toml names the broker"
+            "--rig and the broker options exclude each other, because rig.toml names the broker"
         )
     if broker is None and rig is None and not any(options[1:]) and _DEFAULT_RIG.is_file():
         rig = _DEFAULT_RIG

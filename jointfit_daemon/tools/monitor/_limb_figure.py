@@ -20,8 +20,8 @@ _Dot = tuple[int, int]
 _LEAST_REACH_M = 0.2
 """Smallest size of the drawn region, m."""
 _BRANCHED_TURN_DEG = 35.0
-"""Direction of view on a limb with two sides, degrees from the view from the side. Both sides are
-visible in this direction."""
+"""Angle between the direction of view and the lateral direction for a limb with two sides, degrees.
+In a lateral view, one side would hide the other."""
 _LEAST_HORIZONTAL = 0.1
 """Smallest horizontal component of the unit vector ahead of the subject; shorter vectors are not
 used."""

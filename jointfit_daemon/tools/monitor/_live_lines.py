@@ -31,7 +31,7 @@ _WIDE = 72
 _LEAST_CURVE, _MOST_CURVE = 3, 24
 """Smallest and largest number of rows of the curve."""
 _WITH_SD = ("flexion_deg", "elevation_deg", "inner_deg")
-"""Names of the angles whose standard deviation may be the `sd_deg` of a joint."""
+"""Names of the angles to which the `sd_deg` of a joint applies."""
 
 
 def pose_age_s(rig: RigView, now: Moment) -> float | None:
@@ -95,7 +95,7 @@ def _is_uncalibrated(rig: RigView) -> bool:
 def _no_pose(rig: RigView, width: int) -> list[Line]:
     """Return the reason for a missing angle, and the remedy."""
     if rig.info is None and rig.pose is not None:
-        text = "The layout of the rig (bridge/info) is missing: the account may not read it."
+        text = "The layout of the rig (bridge/info) is missing: the account cannot read it."
     elif _is_uncalibrated(rig):
         return [
             Line.of("Not calibrated yet", "strong"),
@@ -107,7 +107,7 @@ def _no_pose(rig: RigView, width: int) -> list[Line]:
         ]
     else:
         text = (
-            "Waiting for the first pose (pose/ui). If none comes: the account may not read it, or"
+            "Waiting for the first pose (pose/ui). If none comes: the account cannot read it, or"
             " pose_ui_hz is low."
         )
     return wrap(text, width, "muted")

@@ -53,7 +53,7 @@ def format_bytes(count: float) -> str:
 
 
 def _duration_s(rig: RigView, recording: RecordingState, now: Moment) -> float:
-    """Return the duration in the message; add the time since the message if recording."""
+    """Return the duration of the recording, including the time since the last health message."""
     gateway_us = rig.gateway_us(now)
     if not recording.active or gateway_us is None or rig.health is None:
         return recording.duration_s

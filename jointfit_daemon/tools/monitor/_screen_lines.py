@@ -203,7 +203,8 @@ def _waiting_lines(state: MonitorState, width: int) -> list[Line]:
         ),
         Line.of("  jointfitd --config rig.toml", "imu"),
         *wrap(
-            "If it runs: host and port under [mqtt] of its rig.toml must be those of this broker,"
+            "If the daemon runs: host and port under [mqtt] of its rig.toml must be those of this"
+            " broker,"
             " and this account must have the right to read its topics.",
             width,
             "muted",

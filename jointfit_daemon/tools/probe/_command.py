@@ -74,12 +74,13 @@ def probe(
 ) -> None:
     """List serial ports, CAN interfaces and motion-capture servers; listen where requested.
 
-    Opens only the named ports, interfaces and hosts, and changes no setting of a device. A port is
-    read at the usual speeds of the installed drivers until one of them decodes the data; layouts of
-    serial-table and can-table in rig.toml are tried, too. Prints lines for rig.toml. With
-    --physical-test it opens that sensor as the daemon does, guides through three rotations, and
-    prints the corrections. Exit codes: 0 every named device was recognized, or the configured
-    frames are correct; 1 a device was not recognized, or the frames are wrong; 2 invalid options.
+    The command opens only the named ports, interfaces and hosts, and changes no setting of a
+    device. A port is read at the usual speeds of the installed drivers until a driver decodes the
+    data; layouts of serial-table and can-table in rig.toml are tried, too. Lines for rig.toml are
+    printed. With --physical-test, the command opens the sensor as the daemon does, guides the user
+    through three rotations, and prints the corrections. Exit codes: 0 every named device was
+    recognized, or the configured frames are correct; 1 a device was not recognized, or the frames
+    are wrong; 2 invalid options.
     """
     if physical_test is not None:
         if serial or can or mocap or network:

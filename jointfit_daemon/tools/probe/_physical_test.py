@@ -24,7 +24,7 @@ speeds."""
 
 
 class PhysicalTestError(Exception):
-    """The sensor sent no orientation, or did not rest within the time limit."""
+    """The device was lost or misconfigured, sent no orientation, or had no new rest in time."""
 
 
 async def run_physical_test(
@@ -69,8 +69,8 @@ async def run_physical_test(
             tell(step.format(id=source.id))
             if not await _wait_for_change(source.id, reading, changed, step_s):
                 raise PhysicalTestError(
-                    f"{source.id}: not moved and at rest within {step_s:g} s: repeat the test, and "
-                    "hold the sensor still for a second after each rotation"
+                    f"{source.id}: no rest in a new orientation within {step_s:g} s: repeat the "
+                    "test, and hold the sensor still for a second after each rotation"
                 )
     finally:
         reading.cancel()

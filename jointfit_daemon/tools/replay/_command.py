@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
 _FASTEST = "max"
 _CHOICES = (
-    "byte for byte: the recorded configuration, as fast as possible; leave out {given}, or --verify"
+    "the recorded configuration, as fast as possible: the outputs are compared byte for byte; leave"
+    " out {given}, or --verify"
 )
 
 

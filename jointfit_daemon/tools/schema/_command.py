@@ -63,5 +63,5 @@ def _schema_of(name: str) -> dict[str, Any]:
         return payload_schema(topic)
     known = [*(topic.pattern for topic in PAYLOADS), *requests]
     near = nearest_name(name, known)
-    hint = f"; did you mean {near!r}?" if near else ""
+    hint = f"; did you mean {near!r}?" if near else "."
     raise ValueError(f"no topic {name!r}{hint} Known: {', '.join(known)}")

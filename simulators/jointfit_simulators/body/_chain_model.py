@@ -1,7 +1,8 @@
 """Chain model of a simulated subject, in TOML and OpenSim 4 format.
 
 Invariant: both files describe the same model. The markers of thigh, shank and foot have errors of
-about a centimetre, as in a scaled model. Two markers of the pelvis are exact and locked.
+about a centimetre, as in a scaled model. The markers of the pelvis are exact, and two of them are
+locked.
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ _GAIT_ANKLE = _cycle((0, 0), (0.07, -5), (0.3, 6), (0.46, 11), (0.62, -17), (0.7
 _STRIDE_S = 1.1
 """Duration of a stride, s."""
 
-# Knee angles of sitting down and standing up: seated, leaning, upright, leaning, seated.
+# Angles of knee, thigh and pelvis: seated, leaning, upright, leaning, seated.
 _CHAIR_KNEE = _cycle((0, 92), (0.15, 92), (0.28, 75), (0.45, 4), (0.55, 4), (0.75, 70), (0.9, 92))
 _CHAIR_THIGH = _cycle((0, 86), (0.15, 86), (0.28, 66), (0.45, 2), (0.55, 2), (0.75, 60), (0.9, 86))
 _CHAIR_LEAN = _cycle((0, 6), (0.12, 12), (0.24, 38), (0.45, 2), (0.55, 2), (0.72, 35), (0.9, 10))

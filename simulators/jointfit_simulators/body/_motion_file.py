@@ -12,7 +12,7 @@ interpolates the keys::
     pelvis = [0, 0, 0]              # heading, tilt, list
 
 An NPZ file contains ``t`` (n,), s, and some of the arrays ``hip``, ``knee``, ``ankle`` and
-``pelvis`` (n, 3), rad.
+``pelvis`` (n, 3), rad. It may contain the position of the pelvis, ``position`` (n, 3), m.
 
 A MOT or STO file contains coordinates of OpenSim's lower-limb models for the right leg. The axes of
 these models (x forward, y up, z right) are the axes y, z and x of this project. Their pelvis

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 BONES = {"femur": "thigh", "tibia": "shank", "thigh": "thigh", "shank": "shank"}
-"""Segment of the rig for each bone name of a recording (without its side)."""
+"""Segment of the rig for each bone name of a recording, without the suffix for the side."""
 
 OPENCAP_CLUSTERS = {
     "pelvis": ("r.ASIS", "L.ASIS", "r.PSIS", "L.PSIS"),

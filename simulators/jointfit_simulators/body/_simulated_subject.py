@@ -84,8 +84,8 @@ class SimulatedSubject:
             motions, steps, start_s=start_s, transition_s=knobs.transition_s
         )
 
-        # The RMS values of the settings are valid for one minute of these motions (walking and
-        # squats).
+        # The RMS values of the settings are valid for one minute of these motions (for a leg:
+        # walking and squats).
         t_s = np.arange(0.0, 30.0, 0.04)
         reference = np.concatenate([motions[name](t_s) for name in self._limb.reference])
         self._place_sensors(knobs, reference)

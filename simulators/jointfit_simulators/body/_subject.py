@@ -61,7 +61,7 @@ class InstrumentedSubject(Protocol):
 
     @property
     def visible_bones(self) -> tuple[str, ...]:
-        """Segments whose bones the cameras stream as rigid bodies, the reference of a recording."""
+        """Segments whose bones the cameras stream as rigid bodies (the reference of a trial)."""
 
     @property
     def chain(self) -> RigChain:

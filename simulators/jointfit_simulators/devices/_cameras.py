@@ -43,7 +43,8 @@ class Cameras:
     """Optical system that records one subject.
 
     Rigid bodies are defined as an operator defines them: from the markers in upright stance. Their
-    axes are parallel to the optical world (y up), and their pivot is the mean marker position.
+    axes are parallel to the axes of the optical world after its conversion to y up, and their pivot
+    is the mean marker position.
 
     Parameters
     ----------

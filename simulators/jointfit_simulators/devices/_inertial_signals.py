@@ -35,7 +35,7 @@ class InertialSignals:
     Parameters
     ----------
     errors
-        Errors of the sensor; the default is exact measurements.
+        Errors of the sensor; None for exact measurements.
     """
 
     def __init__(self, errors: SensorErrors | None = None) -> None:
@@ -57,7 +57,7 @@ class InertialSignals:
 
     @property
     def rate(self) -> Vector:
-        """Angular rate over the last interval, sensor axes, rad/s; 0 before the second time."""
+        """Angular rate over the last interval, sensor axes, rad/s; 0 before the second update."""
         x, y, z = self._turn
         step_s = self._step_s
         true = (x / step_s, y / step_s, z / step_s) if step_s > 0.0 else (0.0, 0.0, 0.0)

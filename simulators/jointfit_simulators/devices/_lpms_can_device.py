@@ -1,6 +1,7 @@
 """Virtual LP-Research LPMS sensor on CAN, in CANopen, sequential or LP-BUS format.
 
-Invariant: all four channel frames are sent in each period, although two or three contain no data.
+Invariant: by default, all four channel frames are sent in each period, although two or three
+contain no component of the quaternion.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 Invariant: each generation executes its own commands only. A command of the other generation has the
 effect of its number in this generation. For example, 04 writes the flash of generation 3, and 05
-erases its settings. 08 puts generation 1 to sleep, and 16 starts its gyroscope calibration.
-Settings are lost at power-off unless they are stored.
+restores its factory settings. 08 puts generation 1 to sleep, and 16 starts its gyroscope
+calibration. Settings are lost at power-off unless they are stored.
 """
 
 from __future__ import annotations
@@ -75,7 +75,8 @@ class LpmsDeviceOptions:
     """Line speed of the sensor, bit/s. At another speed, both sides receive invalid bytes. None
     accepts any speed (USB)."""
     words: bool = False
-    """Whether checksums are sums of 16-bit words. They differ for addresses above 255 only."""
+    """Whether checksums are sums of 16-bit words. They differ from sums of bytes only for sensor
+    ids above 255."""
     refused_rates: tuple[int, ...] = field(default=())
     """Rates that the firmware does not support, Hz."""
 

@@ -88,7 +88,7 @@ class MipDeviceOptions:
     names_descriptors: bool = True
     """Whether the device answers the request for its descriptors."""
     transform: Quaternion = (1.0, 0.0, 0.0, 0.0)
-    """Saved sensor-to-vehicle rotation. A legacy device sends only its angle about x."""
+    """Saved sensor-to-vehicle rotation of a device of the current family."""
     roll_rad: float = 0.0
     """Saved sensor-to-vehicle rotation angle of a legacy device about x, rad."""
     baud: int | None = None

@@ -2,8 +2,8 @@
 
 Input poses are in a world with z up, in m. Packets have the axes of the server, in mm.
 
-Invariant: all markers and bodies are sent, in the order of the settings. If a marker or body is
-missing, all bits of its values are set.
+Invariant: all labeled markers and bodies are sent, in the order of the settings. If a marker or
+body is missing, all bits of its position and rotation are set.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Simulated server of Qualisys Track Manager (QTM) on the loopback interface.
 
-Invariant: the server sends no text answer to StreamFrames. One existing client would treat such an
-answer as the answer to its next command.
+Invariant: the server sends no text answer to a valid command StreamFrames. One existing client
+would treat such an answer as the answer to its next command.
 """
 
 from __future__ import annotations

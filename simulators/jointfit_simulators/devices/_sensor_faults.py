@@ -1,7 +1,7 @@
 """Faults of a sensor during a run: stuck output, slip and heading drift.
 
-A fault changes the measured orientations only. A command takes effect with the next block, at most
-0.2 s later.
+A fault changes the measured orientations only. A command takes effect with the next block of
+samples, at most 0.2 s later.
 """
 
 from __future__ import annotations

@@ -82,7 +82,7 @@ class ViconClient:
     wanted: frozenset[int] = frozenset()
     streams: bool = False
     frames: int = 0
-    """Number of single frames that the client requested."""
+    """Number of requested single frames that are not yet sent."""
     informed: frozenset[int] = frozenset()
     """Types of static objects whose current state the client has received."""
 

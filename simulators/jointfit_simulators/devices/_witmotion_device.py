@@ -101,7 +101,7 @@ class WitMotionDevice(SerialDevice):
     wire_noise
         Noise applied to each sample to the host.
     now_s
-        Clock of the lock, s.
+        Clock that measures the time since the unlock command, s.
     """
 
     streaming = True  # the device always sends

@@ -91,7 +91,7 @@ class XImu3DeviceOptions:
     missing: tuple[str, ...] = ()
     """Settings that the firmware of the device lacks."""
     error: str = ""
-    """Text of an error message that accompanies the first measurement; empty for none."""
+    """Text of an error message that accompanies the first measurement; empty for no message."""
     battery_percent: float = 80.0
     first_tick: int = 0
     """Clock value at power-up, us."""
@@ -143,7 +143,7 @@ class XImu3Device(SerialDevice):
 
     @property
     def rate_hz(self) -> float:
-        """Rate of the orientations, Hz, or of the raw measurements without orientations."""
+        """Rate of the orientations, Hz, or of the raw measurements if there are no orientations."""
         for key in ("ahrs_message_rate_divisor", "inertial_message_rate_divisor"):
             if divisor := self._number(key):
                 return BASE_RATE_HZ / divisor

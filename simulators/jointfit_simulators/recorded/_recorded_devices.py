@@ -149,7 +149,7 @@ class RecordedCameras:
     Raises
     ------
     UnplayableRecordingError
-        The recording does not contain the server description.
+        The recording does not contain the description of the server or of the model.
     """
 
     def __init__(self, chunks: Iterable[tuple[int, bytes]], command_port: int = 0) -> None:
@@ -170,8 +170,9 @@ class RecordedCameras:
                     self.chunks.append((t_ns, data))
         if info is None or model is None:
             raise UnplayableRecordingError(
-                "mocap: the recording begins after the connection to the camera server: its "
-                "description is missing. Choose a recording that began with the daemon"
+                "mocap: the recording begins after the connection to the camera server: the "
+                "description of the server is missing. Choose a recording that began with the "
+                "daemon"
             )
         self._info, self._model = info, model
         self._port = NatNetPort(command_port)
@@ -191,7 +192,7 @@ class RecordedCameras:
         return self._client is not None
 
     def begin(self, now_ns: int) -> None:
-        """Set the host time of the start of the recording, ns, which defines the recorded clock."""
+        """Set the host time at which the playback starts, ns. It defines the recorded clock."""
         self._began_ns = now_ns
 
     def send(self, data: bytes) -> None:

@@ -49,7 +49,8 @@ class RecordedScene:
     Raises
     ------
     UnplayableRecordingError
-        A device has a driver that cannot be simulated.
+        A device has a driver that cannot be simulated, or the description of the camera server is
+        missing.
     """
 
     def __init__(self, session: RecordedSession, directory: Path, broker: tuple[str, int]) -> None:

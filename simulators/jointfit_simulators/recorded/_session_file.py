@@ -65,7 +65,9 @@ def read_session_chunks(path: Path) -> RecordedSession:
 
     if rig is None or not found:
         what = "rig" if rig is None else "bytes of devices"
-        raise UnplayableRecordingError(f"{path}: the recording contains no {what}: choose another")
+        raise UnplayableRecordingError(
+            f"{path}: the recording contains no {what}: choose another recording"
+        )
     begin_ns = min(chunks[0][0] for chunks in found.values())
     return RecordedSession(
         rig,

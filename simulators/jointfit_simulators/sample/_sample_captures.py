@@ -1,4 +1,4 @@
-"""Captures for the sample data on three types of wires. Invariant: no port is opened.
+"""Captures of three types of wires for the sample data. Invariant: no port is opened.
 
 All captures contain the same movement: as raw bytes of an Xbus UART, as the text of ``candump -L``,
 and as a pcap file (raw IPv4, nanoseconds) with the datagrams of a NatNet server.

@@ -2,7 +2,8 @@
 
 Invariant: equal seeds produce equal files. Sensors, cameras and reference have one common world
 frame, and all streams of a trial have one common clock, as in an edited recording. Soft-tissue
-artefact, sensor alignment, sensor errors, marker noise and occlusion have the default settings.
+artefact, sensor alignment, sensor errors, marker noise and occlusion have the default settings, but
+the markers of the planar trial have no soft-tissue artefact.
 """
 
 from __future__ import annotations
@@ -52,12 +53,12 @@ CAPTURE_HZ = 100.0
 CAPTURE_S = 2.0
 """Duration of the captures, s."""
 APART_S = 200.0
-"""Time between the starts of two trials, s. Because of this time, the noise of the trials is
+"""Time between the starts of two trials, s. It is so long that the noise of the trials is
 independent."""
 TRIALS = {"standing": 5.0, "squats": 8.0, "walking": 8.0, "knee_swings": 8.0, "sit_to_stand": 8.0}
 """Duration of each trial, s, by name."""
 _MOTIONS = {"standing": "stand", "squats": "squat", "walking": "walk"}
-"""Name of the motion, for trials with another name than their motion."""
+"""Names of motions that differ from the names of their trials."""
 SWINGS_S = 10.0
 """Duration of the planar movement, s."""
 _IDS = {

@@ -1,4 +1,4 @@
-"""IMUs of a scene whose messages a table describes; each sensor has another table.
+"""IMUs of a scene whose messages a table describes; each sensor has its own table.
 
 The table is in rig.toml and in the simulated device. The first two sensors send integers, in binary
 frames or in a CAN frame that follows a frame with the time. The next two sensors send text lines,

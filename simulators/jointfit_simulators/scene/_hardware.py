@@ -51,7 +51,7 @@ def create_hardware(
     now_ns: int,
     sync_line: bool = False,
 ) -> SceneHardware:
-    """Create the devices of a scene, and switch them on.
+    """Create the devices of a scene and their tables in rig.toml.
 
     Parameters
     ----------

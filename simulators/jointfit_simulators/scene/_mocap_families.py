@@ -90,7 +90,7 @@ class CameraPlace:
 
     @property
     def markers_by_body(self) -> dict[str, tuple[str, ...]]:
-        """Markers of each rigid body that has its own markers."""
+        """Markers of each rigid body; empty for a body without its own markers."""
         owned = {part.capitalize(): names for part, names in self.clusters.items()}
         return owned | {body: () for body in self.bodies if body not in owned}
 
@@ -103,8 +103,8 @@ class MocapFamily:
     """Function that returns a server, and the lines that follow the driver in the ``[mocap]``
     table."""
     sync_line: bool = False
-    """Whether ``sync_line`` is supported. If so, a frame states whether its exposure causes an
-    edge.
+    """Whether the ``[mocap]`` table names the sync line of the scene (``sync_line``), which has an
+    edge at every exposure.
     """
 
 

@@ -66,7 +66,7 @@ class OpticalStream:
         return self._block.host_ns
 
     def fill(self, observation: Observation) -> list[int]:
-        """Add markers to the planned frames; return the transmission times, ns."""
+        """Add markers and rigid bodies to the planned frames; return the transmission times, ns."""
         if self._server is None:
             return []
         frames = self.cameras.capture(observation)

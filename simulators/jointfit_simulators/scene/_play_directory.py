@@ -43,7 +43,7 @@ class PlayDirectory:
         self._before = _state(file)
 
     def command_port(self, asked: int | None) -> int:
-        """Return the command port for the NatNet server; 0 selects a free port.
+        """Return the command port for the motion-capture server; 0 selects a free port.
 
         Without a requested port, the function returns the port of the previous run in this
         directory if it is free. A running daemon can then reconnect to the server.

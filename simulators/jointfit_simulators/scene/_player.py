@@ -1,9 +1,9 @@
-"""Real-time scheduler of a scene, which sends each sample in time.
+"""Real-time scheduler of a scene, which sends each sample at its transmission time.
 
 The scheduler *plans* blocks of 0.2 s: it computes all samples of a block before the block begins.
 
 Transmission times are absolute. Overdue samples are sent at once, in order and with their own time
-stamps. After an interruption of some seconds (a suspended machine), the missed time is skipped.
+stamps. After an interruption of more than two seconds, the missed time is skipped.
 """
 
 from __future__ import annotations

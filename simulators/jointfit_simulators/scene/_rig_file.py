@@ -105,7 +105,7 @@ def _chain_table(
     chain: RigChain,
     chain_model: str | None,
 ) -> list[str]:
-    """Return the lines of the ``[chain]`` table; `tracked` contains all parts without sensors."""
+    """Return the lines of the ``[chain]`` table; `tracked` contains the parts with markers."""
     limb = ["[chain]"]
     if chain.joints:
         limb.append(f"joints = {_names(chain.joints)}")

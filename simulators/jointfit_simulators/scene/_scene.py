@@ -377,7 +377,7 @@ class Scene:
         }
 
     def account(self) -> dict[str, object]:
-        """Return the total numbers of samples that were sent, dropped, refused and unheard."""
+        """Return the total numbers of samples of each device, by the names of the counters."""
         streams = self._hardware.streams
         return {
             "sent": {**{n: s.device.sent for n, s in streams.items()}, "mocap": self._optical.sent},

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
 
 SampleCallback = Callable[[str, int, int], None]
-"""Callback for every sent sample: device, transmitted sample number, true host time in ns."""
+"""Callback for every sent sample. The arguments are the name of the device, the transmitted sample
+number, and the true host time, ns."""
 
 _MOST_EDGES = 4096
 """Maximum number of planned sync edges. Older edges are dropped."""
@@ -39,7 +40,7 @@ class SceneImuDevice(ImuDevice, Protocol):
     """Virtual IMU with faults that a scene can trigger."""
 
     def edge(self, device_ns: int) -> None:
-        """Add an edge on the sync input at a device time; ignored without a sync input."""
+        """Add an edge on the sync input at a device time; do nothing without a sync input."""
 
     @property
     def counter(self) -> int:
@@ -50,7 +51,7 @@ class SceneImuDevice(ImuDevice, Protocol):
         """Transmission time of a sample from first to last byte, ns; 0 on a wire without delay."""
 
     def lose(self, count: int) -> None:
-        """Lose the next `count` samples; the counter increments, but they are not sent."""
+        """Do not send the next `count` samples; the sample counter counts them nevertheless."""
 
     def power_cycle(self) -> None:
         """Interrupt the power supply; clock and counter restart."""

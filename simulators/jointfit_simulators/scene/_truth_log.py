@@ -15,11 +15,11 @@ The other lines follow at 100 Hz::
      "joint_m": {"hip": [x, y, z], "knee": …, "ankle": …},
      "knee": {"flexion": …, "adduction": …, "rotation": …}, "included": …}
 
-The angles belong to the main joint: ``knee``, ``elbow`` or ``lumbar``. Knee flexion is positive
-with the heel back, adduction with the foot towards the midline, and rotation with the toes towards
-the midline. Elbow flexion is positive forward, and rotation is pronation. Lumbar flexion is
-positive forward, ``adduction`` is bending to the right, and rotation is positive to the left. The
-included angle is pi when straight. An unknown value is null.
+The angles belong to the main joint: ``knee``, ``right_knee``, ``elbow`` or ``lumbar``. Knee flexion
+is positive with the heel back, adduction with the foot towards the midline, and rotation with the
+toes towards the midline. Elbow flexion is positive forward, and rotation is pronation. Lumbar
+flexion is positive forward, ``adduction`` is bending to the right, and rotation is positive to the
+left. The included angle is pi when straight. An unknown value is null.
 """
 
 from __future__ import annotations

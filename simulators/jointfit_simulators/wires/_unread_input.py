@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 _INTERVAL_S = 0.02
 _IDLE_S = 0.3
-"""Time without unread bytes after which all bytes are read, s. The kernel delivers in blocks of 4
-KB."""
+"""If no byte is unread for this time, the hosts have read all bytes, s. The kernel delivers bytes
+in blocks of 4 KB."""
 _STALLED_S = 2.0
-"""Time without change after which no host reads, s."""
+"""If the number of unread bytes does not change for this time, no host reads, s."""
 _MOST_S = 6.0
 """Longest wait, s. Without this limit, a host that polls its device would delay the end forever."""
 
