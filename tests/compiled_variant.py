@@ -18,7 +18,7 @@ def run_compiled(*words: str | Path, pure: bool = False) -> subprocess.Completed
 
     Skips the test if the tree was not built from the current sources.
     """
-    if not _is_current():
+    if not is_current():
         pytest.skip("make compiled was not run (Debian: apt install gcc python3-dev)")
     paths = [str(ROOT / "build" / "compiled"), str(ROOT)]
     return subprocess.run(
@@ -29,6 +29,7 @@ def run_compiled(*words: str | Path, pure: bool = False) -> subprocess.Completed
 
 
 @cache
-def _is_current() -> bool:
+def is_current() -> bool:
+    """Return whether build/compiled contains the current sources."""
     words = [sys.executable, str(ROOT / "packaging" / "compiled.py"), "--check"]
     return subprocess.run(words, capture_output=True, check=False).returncode == 0

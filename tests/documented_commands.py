@@ -40,7 +40,7 @@ OPTIONAL_PROGRAMS = ("mosquitto_sub", "mosquitto_pub", "openssl")
 """Programs whose commands run only if the programs are installed."""
 
 NOT_RUN = {
-    r"^(sudo|sudoedit|systemctl|journalctl) |apt ": "needs root and systemd: tests/vm_service",
+    r"\b(sudo|sudoedit|systemctl|journalctl) |apt ": "needs root and systemd: tests/vm_service",
     r"/etc/|^chown |^mosquitto_passwd ": "needs root: changes an installed broker or service",
     r"^\. \.venv/": "the environment of the tests has the programs already",
     r"^git clone |pip install |^pipx ": "needs the network",

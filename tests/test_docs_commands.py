@@ -40,6 +40,15 @@ COMMANDS = re.compile(
 IN_SAMPLE = "`jointfit sample sample && cd sample`"
 """Pages with these words are read in the folder of sample data."""
 SHORT_PHASES = "--align-s 5 --static-s 2 --functional-s 8"
+STARTED = re.compile(r"\$\(([\w-]+)|^(?:\w+=[^ (]* )*([\w-]+) ")
+"""The first program of a command, after or within assignments."""
+TESTED_PROGRAMS = {
+    "jointfit", "jointfitd", "jointfit-sim", "mosquitto_pub", "mosquitto_sub", "openssl",
+    "awk", "cd", "head", "printf", "python", "sleep",
+}  # fmt: skip
+"""Programs that a test of a page may start. A page that needs another one, for example one that
+asks the service manager, gets a reason in `NOT_RUN` or extends this set.
+"""
 MAN_PAGES = sorted((ROOT / "packaging" / "man").glob("*.1"))
 
 
@@ -191,6 +200,19 @@ def test_a_man_page_names_options_and_commands_that_exist(page: Path) -> None:
         assert subcommands
         assert [name for name in subcommands if not re.search(rf"\b{name}\b", overview)] == []
     assert [name for name in options if name not in overview] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_run_by_the_tests_start_only_programs_that_every_machine_can_run(
+    page: Path,
+) -> None:
+    started = {
+        found[1] or found[2]
+        for block in blocks_of(page)
+        for command in block.commands
+        if reason_not_to_run(command) is None and (found := STARTED.search(command)) is not None
+    }
+    assert started <= TESTED_PROGRAMS
 
 
 def test_a_difference_in_the_printed_output_is_noticed() -> None:

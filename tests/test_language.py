@@ -55,6 +55,7 @@ def messages(text: str) -> str:
     return " ".join(string for string in _strings(text)[1] if " " in string)
 
 
+@cache
 def _strings(text: str) -> tuple[list[str], list[str]]:
     """Return the strings of a Python module that are statements of their own, and the others."""
     nodes = list(ast.walk(ast.parse(text)))

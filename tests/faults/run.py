@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.outputs.mqtt import NoAnswerError
 from tests.endurance.slopes import RESULTS as ENDURANCE
-from tests.endurance.slopes import table_of
+from tests.endurance.slopes import outcomes_of, table_of
 from tests.faults.gateway import running_gateway
 from tests.faults.peer_table import RESULTS as PEERS
 from tests.faults.peer_table import table_of as peer_table_of
 from tests.load.table import RESULTS as LOAD
 from tests.load.table import table_of as load_table_of
 from tests.mutation.score import RESULTS as MUTATION
-from tests.mutation.score import table_of as mutation_table_of
+from tests.mutation.score import text_of as mutation_text_of
 
 if TYPE_CHECKING:
     from tests.broker_fixture import Broker
@@ -139,6 +139,8 @@ def render(results: dict[str, Any]) -> str:
     samples = f"{endurance['samples']:,}".replace(",", " ")
     factor = f"{endurance['factor']} times real time"
     page = page.replace("{samples}", samples).replace("{factor}", factor)
+    page = page.replace("{variant}", endurance["variant"])
+    page = page.replace("{outcomes}", outcomes_of(endurance))
     load = json.loads(LOAD.read_text("utf-8"))
     page = page.replace("{minutes}", f"{load['seconds'] / 60.0:g}")
     page = page.replace("{load}", load_table_of(load))
@@ -148,10 +150,10 @@ def render(results: dict[str, Any]) -> str:
 
 
 def _mutation() -> str:
-    """Return the table of the stored mutants, if there are any."""
+    """Return the score of the stored mutants, if there are any."""
     if not MUTATION.exists():
         return "No complete run is stored yet."
-    return mutation_table_of(json.loads(MUTATION.read_text("utf-8")))
+    return mutation_text_of(json.loads(MUTATION.read_text("utf-8")))
 
 
 def stored() -> dict[str, Any]:

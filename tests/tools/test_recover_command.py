@@ -30,7 +30,9 @@ def test_an_unfinished_file_gets_its_final_name(tmp_path: Path) -> None:
     torn.write_bytes(content[: content.index(b"jointfit.end")])
     result = recover(torn)
     assert result.exit_code == 0, result.output
-    assert "the recording was not closed: up to its last second may be missing" in result.output
+    assert (
+        "the recording was not closed: messages of its last second may be missing" in result.output
+    )
     assert f"{whole}: 1000 messages" in result.output
     assert list(read_events(whole)) == [*map(Tick, range(1000))]
     assert torn.exists()

@@ -310,5 +310,5 @@ def test_circle_limits_of_the_caller_apply() -> None:
     strict, lax = CircleLimits(sd=0.001), CircleLimits(sd=1.0)
     refused = circle_estimate(p, limits=strict).refused
     assert refused is not None
-    assert "uncertain to" in refused
+    assert "predicted error" in refused
     assert circle_estimate(p, limits=lax).refused is None

@@ -357,6 +357,13 @@ def test_a_wrong_number_is_reported_with_its_line_and_remedy(tmp_path: Path) -> 
         read_osim(path)
 
 
+def test_a_word_among_any_number_of_coefficients_is_reported(tmp_path: Path) -> None:
+    path = write_osim(tmp_path / "small.osim", [ROOT, HIP, KNEE], MARKERS)
+    path.write_text(path.read_text().replace("<coefficients>1 0<", "<coefficients>1 none<"))
+    with pytest.raises(MalformedFileError, match="coefficients is '1 none', expected numbers with"):
+        read_osim(path)
+
+
 def test_an_unknown_parent_frame_is_named_with_the_bodies(tmp_path: Path) -> None:
     path = write_osim(tmp_path / "small.osim", [ROOT, HIP, KNEE], MARKERS)
     socket = "<socket_parent>/bodyset/femur<"

@@ -222,7 +222,7 @@ def test_scaling_the_parent_stretches_the_way_of_the_center() -> None:
     [
         (Joint("coupled"), "needs a path of 4 samples, has 0"),
         (Joint("hinge", path=samples()), "a path, but its joint is 'hinge'"),
-        (Joint("coupled", path=samples()[::-1]), "must grow"),
+        (Joint("coupled", path=samples()[::-1]), "must increase"),
         (Joint("coupled", path=((0, 1, 1, 0, 0, 0, 0, 0), *samples()[9:12])), "not of length 1"),
         (Joint("coupled", path=((-1, 1, 0, 0, 0, 0, 0, np.inf), *samples()[:3])), "not finite"),
     ],

@@ -156,7 +156,7 @@ def test_a_low_r2_on_soft_tissue_is_no_alarm() -> None:
     play(monitor, 12.0, 4.0, tissue_rad=0.2)
     refused = str(lag_payload(monitor.health()["S1"])["tracked_refused"])
     assert refused.startswith("R² 0.")
-    assert refused.endswith("normal on soft tissue, the lag in force stays")
+    assert refused.endswith("normal on soft tissue, the lag in use is not changed")
     assert "check" not in refused
 
 

@@ -263,7 +263,7 @@ def test_a_segment_without_sensors_is_left_out_of_opensim_files(
     found = read_sto(out)
     assert found.columns == ("thigh_sd",)
     assert len(found.t_s) == N - 10
-    assert "left out: knee_flexion, knee_adduction" in json.loads(result.stdout)["notes"][-2]
+    assert "knee_flexion, knee_adduction" in json.loads(result.stdout)["notes"][-2]
 
 
 def test_a_table_without_a_complete_frame_is_a_failure(files: Path, tmp_path: Path) -> None:

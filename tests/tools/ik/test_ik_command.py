@@ -265,7 +265,9 @@ def test_a_coordinate_known_in_few_frames_does_not_empty_the_table(folder: Path)
     assert found.columns == NAMES[:-1]
     assert np.isfinite(found.values).all()
     np.testing.assert_allclose(found.t_s, np.arange(25) / 50.0)
-    assert "out.sto: columns known in less than half of the frames left out: knee" in notes
+    assert (
+        "out.sto: left out, because they are known in less than half of the frames: knee" in notes
+    )
     assert "out.sto: 25 of 40 frames written, the others have unknown values" in notes
 
 

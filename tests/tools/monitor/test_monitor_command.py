@@ -42,7 +42,7 @@ def test_without_textual_the_pip_command_is_named(monkeypatch: pytest.MonkeyPatc
         (["--user", "viewer"], "--user and --password-file: expected both"),
         (["--user", "viewer", "--password-file", "none"], "none: No such file"),
         (["--request-key-file", "none"], "none: No such file"),
-        (["--rig", str(EXAMPLE), "--broker", "localhost"], "expected one of them"),
+        (["--rig", str(EXAMPLE), "--broker", "localhost"], "exclude each other"),
         (["--rig", "none.toml"], "none.toml"),
         (["--rate", "11"], "--rate"),
     ],

@@ -63,7 +63,7 @@ async def test_the_command_guides_and_ends_with_the_lines_to_paste(tmp_path: Pat
 async def test_a_sensor_that_is_not_turned_ends_the_test_in_words(tmp_path: Path) -> None:
     async with held(tmp_path):
         source = load_rig(tmp_path / "rig.toml").sources[0]
-        with pytest.raises(PhysicalTestError, match="S1: not moved and at rest within 4 s: repeat"):
+        with pytest.raises(PhysicalTestError, match="S1: no rest in a new orientation within 4 s"):
             await run_physical_test(source, lambda _: None, step_s=4.0)
 
 

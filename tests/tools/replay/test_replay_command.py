@@ -174,6 +174,7 @@ async def wait_for_poses(poses: list[dict[str, float]], number: int) -> None:
             await asyncio.sleep(0.01)
 
 
+@pytest.mark.real_time  # the broker drops messages that their reader takes too late
 @pytest.mark.parametrize("speed", [5.0, math.inf])
 async def test_replay_over_mqtt_has_its_own_topics_and_recorded_times_and_drops_nothing(
     run: RecordedRun, broker: Broker, speed: float
