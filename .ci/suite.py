@@ -10,7 +10,8 @@ System tests start daemons in real time, and tests with the marker `real_time` s
 send in real time. Other tests on the same cores can delay both. If such a test fails while others
 run, it is repeated once, alone. It passes only if it then passes, and the summary names it.
 Experiments are repeated in the same way, because those that compute run at low priority and can
-exceed a time limit; a wrong result is computed again. Other tests are not repeated.
+exceed a time limit; a wrong result is computed again. Tests with the marker `alone` measure times,
+which a pause of the machine disturbs, so they are repeated, too. Other tests are not repeated.
 
 Invariant: the exit status is 0 only if both parts passed.
 """
@@ -23,7 +24,12 @@ import subprocess
 import sys
 import time
 import xml.etree.ElementTree as ET
+from itertools import chain
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 BUILD = Path(__file__).resolve().parents[1] / "build"
 WORKERS_PER_CORE = 3
@@ -37,6 +43,8 @@ WORKERS = ("-p", "tests.forked_workers", "--workers")
 ENVIRONMENT = {key: os.environ[key] for key in os.environ if key != "PYTHONDONTWRITEBYTECODE"}
 """Environment of the tests. Hundreds of processes import the project, so it must be compiled only
 once."""
+REPEATED = "-repeated"
+"""End of the name of the report on repeated tests."""
 TESTS_FAILED = 1
 """Exit status of pytest when tests failed."""
 NO_TESTS = 5
@@ -58,23 +66,29 @@ def main(arguments: list[str]) -> int:
     cores = len(os.sched_getaffinity(0))
     workers = (EXPERIMENTS_PER_CORE if experiments else WORKERS_PER_CORE) * cores
 
-    parallel = _run(parts[0], reports, [*WORKERS, str(workers), *arguments])
-    disturbed: list[str] = []
-    if parallel == TESTS_FAILED:
-        disturbed = _repeat_disturbed_tests(parts[0], reports, experiments)
-        parallel = 0 if disturbed else parallel
-    alone = _run(parts[1], reports, arguments or _files_of_tests_alone())
+    disturbed: dict[str, list[str]] = {}
+    statuses = []
+    for part, options in (
+        (parts[0], [*WORKERS, str(workers), *arguments]),
+        (parts[1], arguments or _files_of_tests_alone()),
+    ):
+        status = _run(part, reports, options)
+        if status == TESTS_FAILED:
+            every = experiments or part == parts[1]
+            disturbed[part] = _repeat_disturbed_tests(part, reports, every)
+            status = 0 if disturbed[part] else status
+        statuses.append(status)
 
     duration_s = time.monotonic() - began
-    for test in disturbed:
-        print(f"failed next to others, passed alone: {test}")
+    for test in chain(*disturbed.values()):
+        print(f"failed, then passed alone: {test}")
     print(
         f"{name}: {_counts(reports, disturbed)} in {duration_s:.0f} s on {cores} cores", flush=True
     )
-    failed = [status for status in (parallel, alone) if status not in {0, NO_TESTS}]
+    failed = [status for status in statuses if status not in {0, NO_TESTS}]
     if failed:
         return failed[0]
-    return min(parallel, alone)  # NO_TESTS only if both parts collected nothing
+    return min(statuses)  # NO_TESTS only if both parts collected nothing
 
 
 def _run(part: str, reports: Path, arguments: list[str], report: str = "") -> int:
@@ -89,10 +103,19 @@ def _files_of_tests_alone() -> list[str]:
     return [str(path) for path in files if "mark.alone" in path.read_text(encoding="utf-8")]
 
 
-def _repeat_disturbed_tests(part: str, reports: Path, experiments: bool) -> list[str]:
+def _repeat_disturbed_tests(part: str, reports: Path, every: bool) -> list[str]:
     """Repeat failed tests that others can delay; return their names if this cleared all failures.
 
     The tests are selected by name: `--last-failed` does not select tests whose subtests failed.
+
+    Parameters
+    ----------
+    part
+        Part of the suite, whose report names the failed tests.
+    reports
+        Folder of the reports.
+    every
+        Whether all tests of the part are repeated, not only system tests and tests in real time.
     """
     failed = {
         name
@@ -100,11 +123,12 @@ def _repeat_disturbed_tests(part: str, reports: Path, experiments: bool) -> list
         if {"failure", "error"} & {child.tag for child in case}
     }
     selection = [*map(_node_id, sorted(failed))]
-    if not experiments:
+    if not every:
         selection += ["-m", "system or real_time"]
-    if not failed or _run(part, reports, selection, report="repeated") != 0:
+    report = f"{part}{REPEATED}"
+    if not failed or _run(part, reports, selection, report=report) != 0:
         return []
-    repeated = {name for name, _ in _cases(reports / "repeated.xml")}
+    repeated = {name for name, _ in _cases(reports / f"{report}.xml")}
     return sorted(failed) if failed <= repeated else []
 
 
@@ -125,20 +149,19 @@ def _cases(report: Path) -> list[tuple[str, ET.Element]]:
     return [(f"{case.get('classname')}::{case.get('name')}", case) for case in cases]
 
 
-def _counts(reports: Path, disturbed: list[str]) -> str:
-    suites = [
-        suite
-        for report in sorted(reports.glob("*.xml"))
-        if report.stem != "repeated"
-        for suite in ET.parse(report).getroot().iter("testsuite")  # noqa: S314 - pytest's, just made
-    ]
-    total, failed, errors, skipped = (
-        sum(int(suite.get(key, 0)) for suite in suites)
-        for key in ("tests", "failures", "errors", "skipped")
-    )
-    passed = total - failed - errors - skipped
-    if disturbed:  # these tests passed alone
-        passed, failed, errors = passed + failed + errors, 0, 0
+def _counts(reports: Path, disturbed: Mapping[str, list[str]]) -> str:
+    passed = failed = errors = skipped = 0
+    for report in sorted(reports.glob("*.xml")):
+        if report.stem.endswith(REPEATED):
+            continue
+        for suite in ET.parse(report).getroot().iter("testsuite"):  # noqa: S314 - pytest's, just made
+            total, failures, faults, left_out = (
+                int(suite.get(key, 0)) for key in ("tests", "failures", "errors", "skipped")
+            )
+            if disturbed.get(report.stem):  # all that failed here passed alone
+                failures = faults = 0
+            passed += total - failures - faults - left_out
+            failed, errors, skipped = failed + failures, errors + faults, skipped + left_out
     return f"{passed} passed, {failed} failed, {errors} errors, {skipped} skipped"
 
 

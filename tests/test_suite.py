@@ -40,13 +40,13 @@ REPORT = """<testsuites><testsuite>
 </testsuite></testsuites>"""
 
 
-@pytest.mark.parametrize("experiments", [True, False])
+@pytest.mark.parametrize("every", [True, False])
 @pytest.mark.parametrize("status", [0, 1])
-def test_a_failed_experiment_counts_as_passed_only_if_it_passes_alone(
+def test_a_failed_test_counts_as_passed_only_if_it_passes_alone(
     tmp_path: Path,
     suite: ModuleType,
     monkeypatch: pytest.MonkeyPatch,
-    experiments: bool,
+    every: bool,
     status: int,
 ) -> None:
     (tmp_path / "part.xml").write_text(REPORT, encoding="utf-8")
@@ -58,10 +58,42 @@ def test_a_failed_experiment_counts_as_passed_only_if_it_passes_alone(
         return status
 
     monkeypatch.setattr(suite, "_run", run)
-    cleared = suite._repeat_disturbed_tests("part", tmp_path, experiments)
+    cleared = suite._repeat_disturbed_tests("part", tmp_path, every)
     assert cleared == ([] if status else ["tests.test_suite::test_one"])
-    only_real_time = [] if experiments else ["-m", "system or real_time"]
+    only_real_time = [] if every else ["-m", "system or real_time"]
     assert calls == [[f"{ROOT}/tests/test_suite.py::test_one", *only_real_time]]
+
+
+@pytest.mark.parametrize("repeated", [0, 1])
+def test_a_measurement_that_fails_is_repeated_once_and_named(
+    tmp_path: Path,
+    suite: ModuleType,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    repeated: int,
+) -> None:
+    """A pause of the machine disturbs a measurement of time that runs alone."""
+    calls: list[str] = []
+
+    def run(part: str, reports: Path, _arguments: list[str], report: str = "") -> int:
+        calls.append(report or part)
+        failed = part == "alone"
+        text = REPORT if failed else REPORT.replace("<failure/>", "")
+        counts = f'<testsuite tests="2" failures="{int(failed)}" errors="0" skipped="0">'
+        reports.mkdir(exist_ok=True)
+        (reports / f"{report or part}.xml").write_text(
+            text.replace("<testsuite>", counts), encoding="utf-8"
+        )
+        return repeated if report else int(failed)
+
+    monkeypatch.setattr(suite, "BUILD", tmp_path / "build")
+    (tmp_path / "build").mkdir()
+    monkeypatch.setattr(suite, "_run", run)
+    assert suite.main([]) == repeated
+    assert calls == ["parallel", "alone", "alone-repeated"]
+    printed = capsys.readouterr().out
+    assert ("failed, then passed alone: tests.test_suite::test_one" in printed) == (not repeated)
+    assert f"{4 - repeated} passed, {repeated} failed" in printed
 
 
 @pytest.mark.experiment

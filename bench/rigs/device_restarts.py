@@ -9,6 +9,7 @@ simulator's value is subtracted.
 from __future__ import annotations
 
 import asyncio
+from bisect import bisect_left
 from typing import TYPE_CHECKING, NamedTuple
 
 from bench.rigs.timestamp_errors import OPTICAL, ObservedCore, judge, unexcused
@@ -44,6 +45,22 @@ class RestartRun(NamedTuple):
             and sample.source == source
             and method in {"", sample.method}
         ]
+
+    def errors_from_cameras_ns(self, source: str, method: str) -> list[int]:
+        """Return the errors of a clock method minus the error of the next camera frame, ns."""
+        frames = [
+            (sample.t_ns, sample.error_ns)
+            for sample in self.core.samples
+            if sample.source == OPTICAL and sample.synced and sample.error_ns is not None
+        ]
+        errors = []
+        for sample in self.core.samples:
+            if (sample.source, sample.method) != (source, method) or not sample.synced:
+                continue
+            after = bisect_left(frames, (sample.t_ns,))
+            if after < len(frames) and sample.error_ns is not None:
+                errors.append(sample.error_ns - frames[after][1])
+        return errors
 
     def unexcused_ns(self, source: str) -> list[int]:
         """Return the part of a source's errors that delays of a loaded machine do not explain,
