@@ -90,6 +90,7 @@ def tools_for(architecture: str) -> dict[str, str]:
     tools = {"mmdebstrap": "mmdebstrap"}
     if architecture == "arm64" and platform.machine() != "aarch64":
         tools["qemu-aarch64-static"] = "qemu-user-static binfmt-support"
+        tools["arch-test"] = "arch-test"  # mmdebstrap tests the emulation with it
     return tools
 
 
