@@ -28,7 +28,8 @@ TOOLS = {
     "cc": "gcc",
     "mmdebstrap": "mmdebstrap",
     "qemu-aarch64": "qemu-user",
-    "qemu-aarch64-static": "qemu-user-static",
+    "qemu-aarch64-static": "qemu-user-static binfmt-support",
+    "arch-test": "arch-test",
 }
 """Programs, each with its Debian package. The second QEMU is for Debian's installation."""
 SHORT, LONG = 300, 1300

@@ -19,10 +19,19 @@ CURVES = (
     ("growth-markers", "markers of a segment", "green"),
 )
 """Experiment, label and color of each curve of CPU time."""
-WIDTH, HEIGHT = 760, 420
+FLAT_CURVES = (
+    ("growth-run-time", "frames of a run (instructions)", "blue"),
+    ("growth-recordings", "recordings of a batch (CPU time)", "orange"),
+)
+"""Experiment, label and color of each curve of the cost of one frame or recording."""
+WIDTH, HEIGHT = 760, 720
 LEFT, RIGHT = 92.0, 736.0
 COST_TOP, COST_BOTTOM = 96.0, 356.0
 SIZES, COSTS_US = (1.0, 300.0), (50.0, 5000.0)
+FLAT_TOP, FLAT_BOTTOM = 516.0, 656.0
+COUNTS, RATIOS = (1.0, 1e6), (0.8, 1.25)
+_COUNT_TICKS = {1: "1", 100: "100", 10_000: "10⁴", 1_000_000: "10⁶"}
+_RATIO_TICKS = (0.8, 0.9, 1.0, 1.1, 1.25)
 _SIZE_TICKS = (1, 3, 10, 30, 100, 300)
 _COST_TICKS_US = (100, 300, 1000, 3000)
 _STYLE = """
@@ -37,7 +46,7 @@ text { font-family: system-ui, "Segoe UI", Helvetica, Arial, sans-serif; font-si
 .blue { color: #7fb2ff; } .orange { color: #f0964a; } .green { color: #5eead4; } }
 .name, .dot { fill: currentColor; }
 """
-_SIZE = re.compile(r".*: (\d+)")
+_SIZE = re.compile(r".*: (?:frame )?(\d+)")
 
 
 def growth_plot() -> str:
@@ -57,7 +66,36 @@ def growth_plot() -> str:
     parts.append(
         _text(RIGHT, COST_BOTTOM + 48, "number of sensors, segments or markers", "soft right")
     )
-    return _document(parts)
+    return _document(parts + _flat_panel())
+
+
+def _flat_panel() -> list[str]:
+    """Return the cost of one frame or recording over their number, relative to the first cost."""
+    title = "Cost of one frame or recording, relative to the first"
+    parts = [_text(LEFT, FLAT_TOP - 62, title, "title")]
+    for index, (_, label, color) in enumerate(FLAT_CURVES):
+        parts.append(_text(LEFT + 310 * index, FLAT_TOP - 32, label, f"name {color}"))
+
+    def x(count: float) -> float:
+        return _scale(count, COUNTS, (LEFT + 10, RIGHT - 20))
+
+    def y(ratio: float) -> float:
+        return _scale(ratio, RATIOS, (FLAT_BOTTOM, FLAT_TOP))
+
+    parts += _axes(
+        [(x(count), words) for count, words in _COUNT_TICKS.items()],
+        [(y(ratio), str(ratio)) for ratio in _RATIO_TICKS],
+        FLAT_TOP,
+        FLAT_BOTTOM,
+    )
+    for name, _, color in FLAT_CURVES:
+        points = _points(name)
+        if name == "growth-recordings":  # costs of whole batches
+            points = [(count, cost / count) for count, cost in points]
+        first = points[0][1]
+        parts += _curve([(x(count), y(cost / first)) for count, cost in points], color)
+    parts.append(_text(RIGHT, FLAT_BOTTOM + 48, "number of frames or recordings", "soft right"))
+    return parts
 
 
 def _points(name: str) -> Points:
@@ -112,9 +150,10 @@ def _document(parts: Iterable[str]) -> str:
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}"'
         f' height="{HEIGHT}" role="img" aria-labelledby="title description">\n'
-        '<title id="title">CPU time of a frame by size of the rig</title>\n'
-        '<desc id="description">CPU time of a frame against the number of sensors, segments'
-        " and markers, on logarithmic axes.</desc>\n"
+        '<title id="title">Growth of the costs with size and number</title>\n'
+        '<desc id="description">Above, the CPU time of a frame against the number of sensors,'
+        " segments and markers. Below, the cost of one frame against the frames of a run, and of"
+        " one recording against the recordings of a batch. All axes are logarithmic.</desc>\n"
         f'<style>{_STYLE}</style>\n<rect class="page" width="{WIDTH}" height="{HEIGHT}" rx="8"/>\n'
         + "\n".join(parts)
         + "\n</svg>\n"

@@ -1,4 +1,4 @@
-"""Batch of recordings: time with two processes and with one, and memory over many recordings."""
+"""Batch of recordings: time with two processes and with one, memory, and growth with the number."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING
 from unittest.mock import patch
 
 from bench.framework.experiment import Result
-from bench.framework.measurement import speed_experiment, timed_result
+from bench.framework.exponents import growth_exponent
+from bench.framework.measurement import loop_s, speed_experiment, timed_result
 from bench.rigs.gateway import rss_mb
 from jointfit_daemon.tools.batch.executors import run_in_pool
 from jointfit_daemon.tools.batch.find_recordings import find_recordings
+from jointfit_daemon.tools.batch.summary import write_summary
 from tests.reprocessing import recorded_run
 
 if TYPE_CHECKING:
@@ -27,6 +29,8 @@ SAMPLES = 5000
 compared with the start of a process."""
 COUNT, ROUNDS = 16, 2
 """Number of recordings per round, and number of alternating rounds."""
+SIZES, QUICK_SIZES = (1, 3, 10, 30, 100, 300, 1000), (1, 2, 4, 8)
+"""Numbers of short recordings for the growth, in about equal ratios."""
 MANY, WARM = 1000, 50
 """Number of short recordings for the memory, and number of recordings after which all libraries are
 loaded."""
@@ -59,6 +63,53 @@ def batch_results(quick: bool) -> list[Result]:
             "MB", 10, 30,
         ),
     ]  # fmt: skip
+
+
+def recording_growth_results(quick: bool) -> list[Result]:
+    """Measure batches of increasing size in one process, from the search to the summary.
+
+    The CPU time of each step is divided by the time of a fixed loop just before it, so the load of
+    the machine cancels.
+    """
+    sizes = QUICK_SIZES if quick else SIZES
+    costs = []
+    with tempfile.TemporaryDirectory(prefix="jointfit-bench-") as temporary:
+        folder = Path(temporary)
+        _batch_loops(_copies(folder / "warm", 2), folder / "out-warm")
+        for size in sizes:
+            trials = _copies(folder / f"{size}", size)
+            costs.append(_batch_loops(trials, folder / f"out-{size}"))
+            shutil.rmtree(trials)
+    found = growth_exponent(sizes, costs)
+    note = f"± {found.half_width:.3f}, {sizes[0]} to {sizes[-1]}"
+    threshold = 1.5 if quick else 1.2  # a short run has too few recordings
+    return [
+        timed_result("recordings: exponent", round(found.value, 3), "", 1.05, threshold, note=note),
+        *(
+            timed_result(f"recordings: {size}", round(cost, 1), "× loop")
+            for size, cost in zip(sizes, costs, strict=True)
+        ),
+    ]
+
+
+def _batch_loops(trials: Path, out: Path) -> float:
+    """Return the CPU time of a batch with reports in this process, in times of the fixed loop."""
+    out.mkdir()
+    loop, began = loop_s(), time.process_time()
+    tasks = find_recordings(trials, out, ("report",), ())
+    spent = (time.process_time() - began) / loop
+
+    results = []
+    running = run_in_pool(tasks, 1)
+    for _ in tasks:
+        loop, began = loop_s(), time.process_time()
+        results.append(next(running))
+        spent += (time.process_time() - began) / loop
+    _check([result.status for result in results])
+
+    loop, began = loop_s(), time.process_time()
+    write_summary(results, out)
+    return spent + (time.process_time() - began) / loop
 
 
 def _copies(folder: Path, count: int) -> Path:
@@ -99,6 +150,14 @@ EXPERIMENTS = (
     replace(
         speed_experiment(
             "batch-of-recordings", "`jointfit batch` of simulated runs", batch_results
+        ),
+        long=True,
+    ),
+    replace(
+        speed_experiment(
+            "growth-recordings",
+            "Growth with the recordings of a batch",
+            recording_growth_results,
         ),
         long=True,
     ),
