@@ -74,9 +74,9 @@ def _adapter_line(bus: CanBusSettings) -> tuple[str, int, Callable[[int, bool], 
 def least_load(settings: Any, unknown: Iterable[str]) -> Any:
     """Return a sensor's settings with the smallest possible load; None if unknown.
 
-    A faulty choice, such as a misspelled orientation, stands for any valid choice. Its load is at
-    least the smallest load of all choices. If even this load is too large, the line is too slow in
-    any case.
+    A faulty value, such as a misspelled value of the key `orientation`, may stand for any valid
+    value. Its load is at least the smallest load of all valid values. If even this load is too
+    large, the line is too slow in any case.
 
     Parameters
     ----------
@@ -112,7 +112,8 @@ def least_load(settings: Any, unknown: Iterable[str]) -> Any:
 def _choices(field: FieldInfo) -> list[Any]:
     """Return all values of a Boolean or a choice, the default of an inner table, or an empty list.
 
-    Identifiers count as one value, because they do not change the load.
+    The default represents all values of an inner table, such as CAN identifiers, because they do
+    not change the load.
     """
     annotation: Any = field.annotation
     if annotation is bool:
@@ -145,12 +146,12 @@ def check_serial_lines(sources: Sequence[Source]) -> Iterator[Fault]:
         baud = getattr(source.settings, "baud", None)
         if needed is not None and baud is not None and needed > baud:
             rate_hz = int(source.rate_hz * baud / needed)
-            slower = f"set rate_hz = {rate_hz} or less"
+            remedies = [_faster("baud", needed, _BAUDS)]
+            remedies += [f"set rate_hz = {rate_hz} or less"] if rate_hz else []
             yield Fault(
                 f"imu[{source.id}].baud",
                 f"{source.rate_hz:g} Hz need {needed:.0f} bit/s, the line carries {baud}: "
-                f"{_faster('baud', needed, _BAUDS)}"
-                f"{slower if rate_hz else 'no rate in whole Hz is slow enough'}",
+                f"{_either(remedies) or 'no rate in whole Hz is slow enough'}",
                 baud,
             )
 
@@ -158,7 +159,7 @@ def check_serial_lines(sources: Sequence[Source]) -> Iterator[Fault]:
 def check_can_buses(
     sources: Sequence[Source], buses: Mapping[str, CanBusSettings]
 ) -> Iterator[Fault]:
-    """Check every CAN bus with all its sensors, and the serial line of an SLCAN adapter."""
+    """Check every CAN bus with all its sensors, and the serial line of a serial CAN adapter."""
     users: dict[str, list[Source]] = defaultdict(list)
     for source in sources:
         for name, bus in buses.items():
@@ -176,10 +177,11 @@ def check_can_buses(
         needing = f"{', '.join(source.id for source in members)} {verb}"
         on_bus = sum(hz * frame_bits(size, extended=ext) for hz, (size, ext) in sent)
         if on_bus > bus.bitrate:
+            faster = _faster("bitrate", on_bus, _CAN_RATES)
             yield Fault(
                 f"can.{name}.bitrate",
-                f"{needing} {on_bus:.0f} bit/s at most, the bus carries {bus.bitrate}: "
-                f"{_faster('bitrate', on_bus, _CAN_RATES)}lower rate_hz, or use two buses",
+                f"{needing} up to {on_bus:.0f} bit/s, but the bus carries only {bus.bitrate}: "
+                f"{_either([faster, 'lower rate_hz', 'use two buses'])}",
                 bus.bitrate,
             )
 
@@ -188,14 +190,19 @@ def check_can_buses(
         key, speed, bits = line
         on_line = sum(hz * bits(size, ext) for hz, (size, ext) in sent)
         if on_line > speed:
+            faster = _faster(key, on_line, _BAUDS)
             yield Fault(
                 f"can.{name}.{key}",
                 f"{needing} {on_line:.0f} bit/s on the adapter's serial line, which carries "
-                f"{speed}: {_faster(key, on_line, _BAUDS)}lower rate_hz",
+                f"{speed}: {_either([faster, 'lower rate_hz'])}",
                 speed,
             )
 
 
 def _faster(key: str, needed: float, speeds: Sequence[int]) -> str:
     enough = next((speed for speed in speeds if speed >= needed), None)
-    return "" if enough is None else f"set {key} = {enough} or more here and on the device, or "
+    return "" if enough is None else f"set {key} = {enough} or more here and on the device"
+
+
+def _either(remedies: Iterable[str]) -> str:
+    return ", or ".join(filter(None, remedies))

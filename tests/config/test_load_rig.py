@@ -527,6 +527,8 @@ def test_an_11_bit_and_a_29_bit_identifier_of_one_number_are_different() -> None
         ({"xbus": {"baud": 9600}},
          "imu[S1].baud = 9600: 100 Hz need 36000 bit/s, the line carries 9600: set baud = 38400 or "
          "more here and on the device, or set rate_hz = 26 or less"),
+        ({"xbus": {"baud": 300}},
+         "the line carries 300: set baud = 38400 or more here and on the device"),
         ({"xbus": {"baud": 10**12}}, "imu[S1].baud"),
         ({"xbus": {"port": ""}}, "imu[S1].port = '': must not be empty"),
         ({"can": {"channel": "/dev/ttyACM0"}}, 'a serial adapter needs interface = "slcan"'),
@@ -537,8 +539,8 @@ def test_an_11_bit_and_a_29_bit_identifier_of_one_number_are_different() -> None
          "not a bit rate of SLCAN: expected one of 1"),
         ({"can": {"interface": "socketcn"}}, "did you mean 'socketcan'?"),
         ({"can": {"bitrate": 125_000}, "xcdi": {"rate_hz": 400}},
-         "can.can0.bitrate = 125000: S3, S4 need 244000 bit/s at most, the bus carries 125000: "
-         "set bitrate = 250000"),
+         "can.can0.bitrate = 125000: S3, S4 need up to 244000 bit/s, but the bus carries only "
+         "125000: set bitrate = 250000"),
         ({"can": {"interface": "slcan", "transport": "uart"}, "xcdi": {"rate_hz": 200}},
          "can.can0.baud = 115200: S3, S4 need 184000 bit/s on the adapter's serial line"),
     ],

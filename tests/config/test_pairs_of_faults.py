@@ -109,7 +109,7 @@ MISTAKES = (
     ("quaternion = 0x121", "quaternion = 0x21", "id 0x21 on this bus belongs to S3"),
     ('"socketcan"', '"sockettcan"', "did you mean 'socketcan'?"),
     ('"can0"', '"can 0"', "can.can1.channel = 'can 0'"),
-    ("bitrate = 500000", "bitrate = 50000", "the bus carries 50000"),
+    ("bitrate = 500000", "bitrate = 50000", "the bus carries only 50000"),
     ("bitrate = 500000", "bitrate = 500000\nlocal_lopback = true", "did you mean 'local_loopback'"),
     ('"default"', '"../else"', "must be the plain name"),
     ('"anchored"', '"patent21"', "calibration.method"),

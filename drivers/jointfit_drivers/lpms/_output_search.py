@@ -26,17 +26,18 @@ if TYPE_CHECKING:
     from jointfit_protocols.lpms.configuration import CommandTable, LpmsOutput
 
 _EXAMINED = (4, 16, 32, 64, 128, 256)
-"""Numbers of stored packets at which the places are examined. There are few numbers, so that the
+"""Numbers of stored packets at which the places are examined. They grow geometrically, so that the
 total time is proportional to the number of packets."""
 _DECIDING, _MOST_HELD = _EXAMINED[1], _EXAMINED[-1]
-"""Numbers of packets after which a search ends: if one place is possible, and if several are."""
+"""Number of packets at which a search ends if only one place is possible, and number at which it
+ends in any case."""
 _TOLERANCE = 0.01
 """Largest deviation of the norm from 1."""
 _CLEARER = 5.0
-"""Smallest ratio of the second-smallest to the smallest deviation at which the place with the
-smallest deviation is selected."""
+"""The place with the smallest deviation is selected if the second-smallest deviation is at least
+this many times as large."""
 _ROUNDING = 1e-4
-"""Deviation of a norm by rounding; smaller deviations are not compared."""
+"""Deviation of a norm that rounding alone can cause. A smaller deviation counts as this value."""
 
 
 class ArrivedPacket(NamedTuple):
@@ -59,8 +60,8 @@ class OutputSearch:
         self._table = table
         self._alone = PacketLayout(table, table.quaternion)
         self.layout = self._alone
-        """Layout of the packets. Until another layout is found, packets contain the quaternion
-        alone."""
+        """Layout of the packets. Until another layout is found, packets are assumed to contain
+        only the quaternion."""
         self._candidates: dict[int, list[PacketLayout]] = {}
         self._size: int | None = None  # of the packets that `layout` describes
         self._held: list[ArrivedPacket] = []
@@ -93,7 +94,7 @@ class OutputSearch:
         return self._end(found[0] if len(found) == 1 else self._alone) if self._held else []
 
     def release(self) -> list[ArrivedPacket]:
-        """Return the stored packets, because a reply names the outputs."""
+        """Return the stored packets without a search; called when a reply has named the outputs."""
         ready, self._held = self._held, []
         return ready
 
@@ -145,7 +146,7 @@ class OutputSearch:
 
 
 def _masks(outputs: Sequence[LpmsOutput]) -> dict[int, int]:
-    """Return, for each number of values that a subset of `outputs` can have, one such mask."""
+    """Return, by the total number of values, the bit mask of one subset of `outputs`."""
     masks = {0: 0}
     for output in outputs:
         for count, mask in list(masks.items()):

@@ -3,7 +3,7 @@
 A sample of the stream is a frame. A position counts as occluded if a coordinate is not finite, if
 all three coordinates are exactly zero, or if its confidence is zero. Some programs stamp samples
 with the time of their cameras instead of the LSL clock. If the stamps were found to be on the LSL
-clock, each comparison of the clocks is returned as an echo.
+clock, each comparison of the LSL clock of the sender with the host clock is returned as an echo.
 
 Invariant: the output depends only on the chunks fed. The decoder reads no clock and no stream.
 """
@@ -171,7 +171,7 @@ class LslMarkersDecoder:
             out.append(_echo(trip))
 
     def _check_clock(self, stamp_ns: int, arrival_ns: int, out: list[Decoded]) -> None:
-        """Decide once per connection whether the stamps are on the LSL clock."""
+        """Decide after a connection or a restart whether the stamps are on the LSL clock."""
         trip = self._trip
         if self._on_lsl_clock is not None or trip is None or self._settings.time == "sender":
             return
@@ -188,9 +188,9 @@ class LslMarkersDecoder:
         out.append(
             DeviceEvent(
                 "warning",
-                f"the time stamps differ by {delay_ns / NS_PER_S:.1f} s from the clock of LSL: the "
-                'program sends another time, and only arrivals are used; set time = "sender" in '
-                "[mocap]",
+                f"the time stamps differ by {delay_ns / NS_PER_S:.1f} s from the LSL clock: the "
+                "program stamps its samples with another clock, and only their arrival times are "
+                'used; set time = "sender" in [mocap]',
                 {"difference_s": delay_ns / NS_PER_S},
             )
         )
@@ -215,9 +215,10 @@ class LslMarkersDecoder:
         self._repeated += step_ns == 0
         if step_ns == 0 and self._repeated == _REPEATED and 2 * self._repeated > self._steps:
             text = (
-                f"{self._repeated} of {self._steps} samples have the time stamp of the sample "
-                "before, so they are duplicates: the program sends several samples at once; state "
-                "the nominal rate of the stream in the program, or send every sample alone"
+                f"{self._repeated} of {self._steps} samples have the time stamp of the previous "
+                "sample and count as duplicates, because the program sends several samples at "
+                "once: set the nominal rate of the stream in the program, or send each sample "
+                "separately"
             )
             out.append(DeviceEvent("warning", text))
 

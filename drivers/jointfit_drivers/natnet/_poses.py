@@ -1,9 +1,10 @@
 """Conversion of one NatNet frame to columns: SI units, world z up, NaN for missing data.
 
-The server marks missing data. If bit 0 of a body is clear, the body repeats its last valid pose. A
+The server marks missing data. If bit 0 of the params of a body is clear, the body
+repeats its last valid pose. A
 labeled marker that is not visible is absent, or it is flagged as occluded and has an estimated
-position. A missing position in a marker set is (0, 0, 0). A usable marker is not occluded **and**
-point-cloud solved.
+position. A missing position in a marker set is (0, 0, 0). A marker is usable if it is
+point-cloud solved and not occluded.
 """
 
 from __future__ import annotations
@@ -43,10 +44,10 @@ class FrameColumns(NamedTuple):
     residuals: NDArray[np.float64]
     """Residual of each labeled marker, m per camera ray; NaN if missing or zero."""
     suspicious: int
-    """Number of bodies rejected because of a quaternion that is not normalised or numbers that are
-    not finite."""
+    """Number of tracked bodies that were rejected because the norm of the quaternion is not 1, or
+    because a coordinate is not finite or implausibly large."""
     unknown: tuple[int, ...]
-    """Ids that the model does not contain."""
+    """Ids of bodies and markers that the model definition of the server does not contain."""
 
 
 class PoseConverter:
@@ -103,7 +104,7 @@ class PoseConverter:
         twice: set[int] = set()
         for number, x, y, z, _, params, residual in frame.markers:
             if number not in known:
-                if number >> 16:  # model 0: a marker without a model
+                if number >> 16:  # id of the model; 0 is a marker without a model
                     unknown.append(number)
             # The test equals is_near, whose call would take a third of the time of this loop.
             elif (

@@ -4,10 +4,13 @@ r"""Sensor-to-segment and world-to-world alignment of one sensor.
 
 q_ref is the orientation of the body, q_s the orientation of the sensor, q_W the rotation of the
 sensor's world, and q_B the sensor-to-segment alignment. The problem is solved with linear algebra
-of 4x4 matrices. Parameters that the movement does not excite are detected and not estimated. The
-full and the heading-only problem apply to sensors on a rigid plate. Skin-mounted sensors move with
-soft tissue. The fit would attribute this motion to a rotation of the world, with errors of tens of
-degrees at other headings of the subject.
+of 4x4 matrices. Parameters that the movement does not excite are detected and not estimated.
+
+There are three kinds of fit. ``full`` estimates q_W and q_B, ``heading`` restricts q_W to a
+rotation about the vertical, and ``mount`` sets q_W = 1. ``full`` and ``heading`` are reliable only
+for sensors on a rigid plate. Skin-mounted sensors move with soft tissue. The fit would attribute
+this motion to a rotation of the world, with errors of tens of degrees at other headings of the
+subject.
 """
 
 from __future__ import annotations
@@ -90,8 +93,9 @@ def fit_observable_alignment(
     if full.kappa <= MAX_KAPPA_FULL and full.weak_error <= MAX_WEAK_ERROR:
         return full
     no_full = (
-        f"full world alignment: kappa {full.kappa:.3f} (at most {MAX_KAPPA_FULL}), error of the "
-        f"weakest direction {np.rad2deg(full.weak_error):.2f} deg: rotate about two or more axes"
+        f"full world alignment: kappa {full.kappa:.3f} (at most {MAX_KAPPA_FULL}), standard error "
+        f"in the least observable direction {np.rad2deg(full.weak_error):.2f} deg (at most "
+        f"{np.rad2deg(MAX_WEAK_ERROR):.2g} deg): rotate about two or more axes"
     )
 
     heading = fit_sensor_alignment("heading", q_world_sensor, q_optical_body)
@@ -114,9 +118,9 @@ def fit_sensor_alignment(
     and R are the matrices of a quaternion product with the argument as left and right factor. The
     sum of squared differences over unit b and v is smallest at the first singular vectors of
     :math:`M = \sum w_i s_i L(q_{s,i})^T R(q_{ref,i})`. The signs s and the Huber weights w are
-    computed iteratively. For ``heading`` only the columns w and z of M are used. For ``mount`` q_W
-    = 1 and q_B is a robust mean. Source: the quaternion form of AX = YB, Zhuang, Roth and Sudhakar
-    1994.
+    computed iteratively. For ``heading``, only the columns of M for the scalar and the z component
+    of v are used. For ``mount``, q_W = 1 and q_B is a robust mean. Source: the quaternion form of
+    AX = YB, Zhuang, Roth and Sudhakar 1994.
 
     Raises
     ------

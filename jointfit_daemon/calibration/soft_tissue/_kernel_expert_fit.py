@@ -55,10 +55,14 @@ def fit_expert(u: Array, rho: Array, sensors: int, ways: Ways, *, tilted: bool) 
 
     Parameters
     ----------
-    u : ndarray, shape (n, 3 m + 3)
+    u : ndarray, shape (n, 3 sensors + 3)
         Regressors as returned by `model_inputs`, rad.
     rho : ndarray, shape (n, 3)
         Target corrections, rad.
+    sensors : int
+        Number of relative rotations in `u`.
+    tilted : bool
+        Whether the expert also uses the tilts, the last three columns of `u`.
     ways : sequence of sequence of ndarray of bool, shape (n,)
         Groupings of the frames. Each grouping is a sequence of masks, one for each held-out group.
     """
@@ -79,7 +83,7 @@ def fit_expert(u: Array, rho: Array, sensors: int, ways: Ways, *, tilted: bool) 
         raise ValueError("no width to choose")
     _, width, centers, basis, held = best
 
-    # Fit to all frames, with the shares from the stacking of every grouping.
+    # Fit to all frames. The weights (shares) of the penalties result from stacking each grouping.
     C = np.mean([fit(basis, rho, each.shares) for each in held], axis=0)
     leverage = hull(smooth)
     h = np.einsum("ij,jk,ik->i", smooth, leverage, smooth)
@@ -98,14 +102,14 @@ def fit_expert(u: Array, rho: Array, sensors: int, ways: Ways, *, tilted: bool) 
 
 
 def spread_centers(x: Array) -> Array:
-    """Return frames far from each other and from zero, shape (m, width).
+    """Return frames far from each other and from zero, shape (m, k).
 
-    At most 24 frames are selected. Each selected frame has the largest distance from the nearest of
-    zero and the frames selected before (farthest-point selection).
+    At most 24 frames are selected. Each step selects the frame that is farthest from its nearest
+    neighbour among zero and the selected frames (farthest-point selection).
 
     Parameters
     ----------
-    x : ndarray, shape (n, width)
+    x : ndarray, shape (n, k)
         Relative rotations and tilts, in kernel widths.
     """
     distance = np.sum(x**2, axis=1)

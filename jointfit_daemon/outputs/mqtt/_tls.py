@@ -17,6 +17,10 @@ if TYPE_CHECKING:
 # Error numbers of OpenSSL, X509_V_ERR_… in x509_vfy.h.
 _NOT_YET_VALID, _EXPIRED = 9, 10
 _OTHER_NAME, _OTHER_ADDRESS = 62, 64
+_UNTRUSTED = {2, 18, 19, 20, 21}
+"""OpenSSL's codes of a chain that ends at no trusted authority."""
+_REJECTIONS = ("CERTIFICATE", "UNKNOWN_CA", "ACCESS_DENIED", "HANDSHAKE_FAILURE", "DECRYPT_ERROR")
+"""Parts of the names of the alerts with which a broker rejects the certificate of a client."""
 _PLAIN_ANSWERS = {"WRONG_VERSION_NUMBER", "RECORD_LAYER_FAILURE", "HTTP_REQUEST"}
 """Reasons that OpenSSL reports if the peer does not use TLS."""
 
@@ -66,8 +70,8 @@ def tls_context(tls: TlsSettings) -> ssl.SSLContext:
         except (ssl.SSLError, ValueError) as error:
             files = f"cert = {tls.cert}, key = {tls.key or tls.cert}"
             raise TlsFilesError(
-                f"{files}: not a certificate and its own key, both in PEM, the key without a "
-                "passphrase"
+                f"{files}: expected a certificate and its own key, both in PEM, and the key "
+                "without a passphrase"
             ) from error
     return context
 
@@ -84,14 +88,16 @@ def tls_remedy(
     settings
         Table ``[mqtt]``.
     established
-        Whether the client completed its part of the handshake. TLS 1.3 checks the client's
-        certificate last. If the broker closes the connection afterwards, it rejected this
-        certificate. The client does not receive the broker's alert if the connection is reset.
+        Whether the client completed its part of the handshake. With TLS 1.3, the broker verifies
+        the client's certificate only then. If it closes or resets the connection after that, it
+        rejected the certificate. After a reset, the client does not receive the broker's alert.
     """
     if isinstance(error, ssl.SSLCertVerificationError):
-        return f" ({_verification_remedy(error.verify_code, settings)})"
+        return f" ({_verification_remedy(error, settings)})"
     if isinstance(error, ssl.SSLError) and "ALERT" in str(error.reason):
-        return f" ({_rejection_remedy(settings)})"
+        if any(word in error.reason for word in _REJECTIONS):
+            return f" ({_rejection_remedy(settings)})"
+        return f" (the broker ended the handshake with the TLS alert {error.reason})"
 
     plain = isinstance(error, ssl.SSLError) and error.reason in _PLAIN_ANSWERS
     cut = isinstance(error, ssl.SSLEOFError | ConnectionResetError)
@@ -103,8 +109,9 @@ def tls_remedy(
     return ""
 
 
-def _verification_remedy(code: int, settings: MqttSettings) -> str:
+def _verification_remedy(error: ssl.SSLCertVerificationError, settings: MqttSettings) -> str:
     """Return cause and remedy if the verification of the broker's certificate failed."""
+    code = error.verify_code
     trusted = (settings.tls.ca if settings.tls else None) or "the system's certificates"
     if code == _EXPIRED:
         return "the broker's certificate has expired: renew it, or set this machine's clock"
@@ -113,12 +120,15 @@ def _verification_remedy(code: int, settings: MqttSettings) -> str:
     if code in {_OTHER_NAME, _OTHER_ADDRESS}:
         return (
             f"the broker's certificate is for another name than {settings.host}: set host to a "
-            "name in it, or issue one that contains this host name (subjectAltName)"
+            "name in the certificate, or issue a certificate that contains this host name "
+            "(subjectAltName)"
         )
-    return (
-        f"the broker's certificate is not signed by an authority in {trusted}: set [mqtt.tls] ca "
-        "to the certificate of the broker's authority"
-    )
+    if code in _UNTRUSTED:
+        return (
+            f"the broker's certificate is not signed by an authority in {trusted}: set [mqtt.tls] "
+            "ca to the certificate of the broker's authority"
+        )
+    return f"the broker's certificate is not valid: {error.verify_message}: issue another one"
 
 
 def _rejection_remedy(settings: MqttSettings) -> str:

@@ -1,7 +1,7 @@
 """One file of a recording that is being written.
 
-Invariant: after a failed write, the next write continues at the same byte, so the file has no
-damaged range.
+Invariant: after a failed write, the next write continues with the first byte that was not
+written, so the file has no damaged range.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ UNFINISHED = ".part"
 _SEQUENCES = 2**32
 """Modulus of the sequence numbers in MCAP files."""
 _CHUNK_BYTES = 1024 * 1024
-"""Size at which a chunk is closed before the next flush, bytes."""
+"""Size above which a chunk is closed without waiting for the next flush, and largest size of a
+write, bytes."""
 
 
 class RecordedAttachment(NamedTuple):
@@ -196,7 +197,7 @@ def sync_directory(directory: Path) -> None:
 
 
 class _UnwrittenBytes:
-    """Buffer for the bytes of the MCAP library, which loses bytes if a write fails."""
+    """Buffer for the bytes from the MCAP library, which would lose bytes if a write failed."""
 
     def __init__(self) -> None:
         self._data = bytearray()

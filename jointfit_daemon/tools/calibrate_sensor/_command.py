@@ -241,4 +241,4 @@ def _closing_lines(rig: Path, name: str, lines: list[str], *, written: bool) -> 
         return [f"{rig} is unchanged"]
     if written:
         return [f"written to {rig}; the daemon uses it from its next start or reload"]
-    return [f"not written; below the [[imu]] table of {name}, {rig} needs:", *lines]
+    return [f"not written: add these lines to {rig}, below the [[imu]] table of {name}:", *lines]

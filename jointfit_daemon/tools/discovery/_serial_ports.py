@@ -45,7 +45,10 @@ class SerialPortInfo:
 
     @property
     def description(self) -> str:
-        """Maker, product and USB ids, or the name of the driver for other ports."""
+        """Manufacturer, product and USB ids; without USB, the name of the kernel driver.
+
+        The driver of a port on the mainboard is named ``built-in port``.
+        """
         words = [word for word in (self.manufacturer, self.product) if word]
         if self.vendor_id is not None and self.product_id is not None:
             words.append(f"({self.vendor_id:04x}:{self.product_id:04x})")
@@ -65,8 +68,8 @@ def find_serial_ports(root: Path = Path("/")) -> list[SerialPortInfo]:
     by_id, by_path = _links(root, "by-id"), _links(root, "by-path")
     found = []
     for tty in sorted((root / "sys/class/tty").glob("*")):
-        # Consoles and pseudo-terminals have no device. The type 0 (PORT_UNKNOWN) is a reserved name
-        # without hardware.
+        # Consoles and pseudo-terminals have no device. A port of type 0 (PORT_UNKNOWN) is only
+        # a reserved device name, without hardware.
         if not (tty / "device").exists() or read_number(tty / "type") == 0:
             continue
         hardware = (tty / "device").resolve()

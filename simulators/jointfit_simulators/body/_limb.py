@@ -119,6 +119,8 @@ def leg_pose(geometry: LegGeometry, coordinates: Array) -> LegPose:
 
 def included_angle(thigh: Rotation, shank: Rotation) -> Array:
     """Return the inner angle between two long axes, rad, shape (n,); pi if straight."""
+    if not len(thigh):
+        return np.empty(0)  # scipy 1.10 applies no empty rotation
     down = np.array([0.0, 0.0, -1.0])
     a, b = thigh.apply(down), shank.apply(down)
     bend = np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1))

@@ -244,8 +244,8 @@ def test_samples_that_share_one_time_stamp_are_reported_once() -> None:
         for _ in range(16):
             feed(1.0, 2.0, 3.0, at_s=0.16 * chunk)
     texts = feed.texts("warning")
-    assert texts.count("have the time stamp of the sample before") == 1
-    assert "state the nominal rate" in texts
+    assert texts.count("have the time stamp of the previous sample") == 1
+    assert "set the nominal rate" in texts
 
     rare = Feeder(marker("T1"))
     for number in range(200):

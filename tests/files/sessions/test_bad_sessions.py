@@ -8,11 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pyarrow as arrow  # type: ignore[import-untyped]
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from pyarrow import parquet
 
 from jointfit_daemon.files.mocap import MissingPackageError
 from jointfit_daemon.files.sessions import NothingToWriteError, read_session, write_session
@@ -96,6 +94,8 @@ def test_a_length_of_gigabytes_takes_no_memory(written: dict[str, Path], tmp_pat
 def test_rows_that_take_no_space_are_refused_before_they_are_read(
     written: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    arrow = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
     sensors = written["parquet"].with_name("walk_sensors.parquet")
     table = parquet.read_table(sensors)
     path = tmp_path / sensors.name
@@ -108,6 +108,8 @@ def test_rows_that_take_no_space_are_refused_before_they_are_read(
 def test_a_long_text_in_every_row_takes_its_memory_once(
     written: dict[str, Path], tmp_path: Path
 ) -> None:
+    arrow = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
     sensors = written["parquet"].with_name("walk_sensors.parquet")
     table = parquet.read_table(sensors)
     at = next(k for k, name in enumerate(table.column_names) if name in TEXT_COLUMNS)

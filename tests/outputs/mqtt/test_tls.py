@@ -140,8 +140,8 @@ async def test_broker_accepts_the_configured_client_certificate_only(
     [
         ({"ca": "nowhere.crt"}, "nowhere.crt: No such file"),
         ({"ca": "daemon.key"}, "holds no certificate"),
-        ({"cert": "daemon.crt", "key": "broker.key"}, "not a certificate and its own key"),
-        ({"cert": "daemon.crt"}, "not a certificate and its own key"),
+        ({"cert": "daemon.crt", "key": "broker.key"}, "expected a certificate and its own key"),
+        ({"cert": "daemon.crt"}, "expected a certificate and its own key"),
         ({"cert": "daemon.crt", "key": "locked.key"}, "without a passphrase"),
     ],
 )
@@ -184,3 +184,32 @@ def test_tls_remedy_names_the_certificate_if_the_handshake_was_completed() -> No
     reset = ConnectionResetError()
     assert "does not answer to TLS" in tls_remedy(reset, secure)
     assert "requires a client certificate" in tls_remedy(reset, secure, established=True)
+
+
+@pytest.mark.parametrize(
+    ("reason", "told"),
+    [
+        ("TLSV13_ALERT_CERTIFICATE_REQUIRED", "requires a client certificate"),
+        ("SSLV3_ALERT_HANDSHAKE_FAILURE", "requires a client certificate"),
+        ("TLSV1_ALERT_UNKNOWN_CA", "requires a client certificate"),
+        ("TLSV1_ALERT_PROTOCOL_VERSION", "with the TLS alert TLSV1_ALERT_PROTOCOL_VERSION"),
+        ("TLSV1_ALERT_INTERNAL_ERROR", "with the TLS alert TLSV1_ALERT_INTERNAL_ERROR"),
+    ],
+)
+def test_only_alerts_about_certificates_blame_the_certificate_of_the_client(
+    reason: str, told: str
+) -> None:
+    error = ssl.SSLError()
+    error.reason = reason
+    secure = MqttSettings(host="broker", base="jointfit/t", tls=TlsSettings())
+    assert told in tls_remedy(error, secure)
+
+
+@pytest.mark.parametrize(
+    ("code", "told"), [(20, "not signed by an authority in"), (66, "not valid: EE certificate key")]
+)
+def test_a_faulty_certificate_is_not_called_untrusted(code: int, told: str) -> None:
+    error = ssl.SSLCertVerificationError()
+    error.verify_code, error.verify_message = code, "EE certificate key too weak"
+    secure = MqttSettings(host="broker", base="jointfit/t", tls=TlsSettings())
+    assert told in tls_remedy(error, secure)
