@@ -30,7 +30,7 @@ class _Rotation(scipy.spatial.transform.Rotation):
         return np.roll(q, 1, axis=-1) if scalar_first else q
 
     @override
-    def __pow__(self, n: float, modulus: None = None) -> Any:
+    def __pow__(self, n: Any, modulus: None = None) -> Any:
         return self.from_rotvec(n * self.as_rotvec())
 
 

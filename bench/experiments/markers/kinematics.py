@@ -128,7 +128,7 @@ def speed(data: Path) -> list[Result]:
     return [
         Result("seven segments, batch", batch_us(model, y), 400, unit="µs/frame"),
         Result("seven segments, frame by frame with covariance", took, 1200, unit="µs/frame"),
-        Result("tracking error, frame by frame over batch", error / full, 1.001, unit=""),
+        Result("tracking error, ratio of frame by frame to batch", error / full, 1.001, unit=""),
         Result("two segments, batch", batch_us(small, swung), 50, unit="µs/frame"),
         Result(
             "two segments, frame by frame with covariance",
