@@ -24,7 +24,7 @@ def run_compiled(*words: str | Path, pure: bool = False) -> subprocess.Completed
     return subprocess.run(
         [sys.executable, *map(str, words)],
         env=os.environ | {"PYTHONPATH": os.pathsep.join(paths), "JOINTFIT_PURE": str(int(pure))},
-        capture_output=True, text=True, check=False, timeout=140,
+        capture_output=True, text=True, check=False, timeout=290,
     )  # fmt: skip
 
 

@@ -59,7 +59,7 @@ def test_jointfit_pure_imports_sources_instead_of_extension_modules(
 
 
 @pytest.mark.experiment
-@pytest.mark.timeout(300)
+@pytest.mark.timeout(600)
 def test_compiled_modules_and_their_sources_give_the_same_frames_bit_for_bit() -> None:
     outputs = {}
     for pure in (False, True):

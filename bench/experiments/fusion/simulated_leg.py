@@ -22,7 +22,7 @@ from bench.framework.experiment import (
     median_and_worst,
 )
 from bench.framework.material import simulated_subjects
-from bench.subjects.simulated_wearer import bench_rig, phases
+from bench.subjects.simulated_wearer import Phases, bench_rig, phases
 from jointfit_daemon.calibration import CalibrationError, CalibrationTrial, SensorTrack
 from jointfit_daemon.calibration.phases import (
     StaticPose,
@@ -38,7 +38,7 @@ from jointfit_simulators.devices import Cameras, OrientationSensor
 from jointfit_simulators.settings import Knobs
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
     from pathlib import Path
 
     from jointfit_daemon.arrays import Array
@@ -158,21 +158,24 @@ def _rms_deg(angles: Array) -> float:
 
 
 @cache
-def people(seeds: tuple[int, ...] = SEEDS) -> Mapping[Method, list[Errors]]:
-    """Return the errors of every method on every subject, in the order of `seeds`."""
+def people(method: Method, seeds: tuple[int, ...] = SEEDS) -> list[Errors]:
+    """Return the errors of a method on every accepted subject, in the order of `seeds`."""
     rig = bench_rig()
-    found: dict[Method, list[Errors]] = {method: [] for method in METHODS}
+    settings = replace(rig.calibration, method=method)
+    found = []
     for seed in seeds:
-        trials, live = phases(seed), wear_live(seed)
+        trials, live = _worn(seed)
         alignment = fit_plate_alignment(trials.align, rig.calibration)
         pose = take_pose(trials.static, rig)
-        if pose is None:
-            continue
-        for method in METHODS:
-            settings = replace(rig.calibration, method=method)
+        if pose is not None:
             calibration = fit_calibration(pose, trials.functional, alignment, settings, rig.chain)
-            found[method].append(errors_of(calibration, live))
+            found.append(errors_of(calibration, live))
     return found
+
+
+@cache
+def _worn(seed: int) -> tuple[Phases, Live]:
+    return phases(seed), wear_live(seed)
 
 
 def take_pose(static: CalibrationTrial, rig: Rig) -> StaticPose | None:
@@ -206,7 +209,7 @@ def take_pose(static: CalibrationTrial, rig: Rig) -> StaticPose | None:
 
 def _row(method: Method) -> Callable[[Path], list[Result]]:
     def run(_: Path) -> list[Result]:
-        errors = people()[method]
+        errors = people(method)
         goal = KNEE_GOAL_DEG if method == "anchored" else float("inf")
         figures = [
             Result("subjects accepted", float(len(errors)), len(SEEDS), len(SEEDS) - 1, unit=""),
@@ -225,7 +228,7 @@ def _row(method: Method) -> Callable[[Path], list[Result]]:
 
 def centers(_: Path) -> list[Result]:
     """Measure the distances of the joint centers from the ground truth in the static pose."""
-    errors = people()["anchored"]
+    errors = people("anchored")
     figures: list[Result] = []
     for joint in ("hip", "knee", "ankle"):
         figures += median_and_worst(joint, [each.centers_mm[joint] for each in errors], "mm")

@@ -34,6 +34,7 @@ PacketCounter\tAcc_X\tAcc_Y\tAcc_Z\tQuat_q0\tQuat_q1\tQuat_q2\tQuat_q3
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    pytest.importorskip("pyarrow")
     folder = tmp_path_factory.mktemp("written")
     files = {to: write_session(walking_session(), folder, to).files for to in FORMATS}
     chosen = {to: found[0] for to, found in files.items()}
