@@ -307,6 +307,12 @@ class Decoder(Protocol):
     Some decoders decode motion-capture frames that they do not return. Such a decoder counts these
     frames in three attributes of type int: ``unpublished`` (frames whose layout is not known yet),
     ``duplicates`` and ``late``.
+
+    If data cannot be decoded without earlier messages, such as the list of marker names, a decoder
+    has an attribute ``description`` of type tuple of bytes: the newest messages that describe the
+    data, in the order in which a new decoder needs them. A recording that starts later begins with
+    them. Without this attribute, it begins with the chunks that arrived before the first
+    measurement.
     """
 
     @property

@@ -127,7 +127,10 @@ class FrameLatency:
         self._fused.clear()  # states of the previous event that no output encoded
 
     def mark_fused(self, deadline_ns: int | None) -> None:
-        """Count the latency of a frame up to the fusion, from its arrival or from `deadline_ns`."""
+        """Count the latency of a frame up to the fusion.
+
+        The latency begins at `deadline_ns`, or without it at the arrival of the last chunk.
+        """
         found, fused_ns = self._histograms, self._clock()
         if deadline_ns is None:
             began_ns, decoded_ns = self._arrival_ns, self._decoded_ns

@@ -42,7 +42,8 @@ def discovery_topic(settings: MqttSettings) -> str | None:
 def discovery_payload(rig: Rig) -> dict[str, Any]:
     """Return the content of the discovery message.
 
-    Buttons exist only while requests need no signature, because Home Assistant cannot sign.
+    Buttons exist only if the rig can be calibrated and requests need no signature, because Home
+    Assistant cannot sign requests. A planar rig is not calibrated.
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ class Topic:
     pattern: str
     """Name relative to the base topic. A level in capitals is a placeholder."""
     qos: int
-    """Quality of service. The receiver acknowledges messages with 1, but not with 0."""
+    """Quality of service: messages with 1 are acknowledged, messages with 0 are not."""
     retained: bool = False
     """Whether the broker stores the last message for later subscribers."""
 

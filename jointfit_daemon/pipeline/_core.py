@@ -153,6 +153,11 @@ class Core:
         """Lags behind the optical system, by sensor, ns. They are subtracted from the stamps."""
         return self._lag_ns
 
+    def descriptions(self) -> dict[str, tuple[bytes, ...]]:
+        """Return the chunks that new decoders of the open sources need before further chunks."""
+        found = {name: state.description() for name, state in self._sources.items() if state.open}
+        return {name: chunks for name, chunks in found.items() if chunks}
+
     def health(self, now_ns: int) -> CoreHealth:
         """Return the core's part of ``bridge/health``."""
         if self._grid is None:
@@ -310,8 +315,8 @@ class Core:
         outputs = self._process(event.source, state, items)
 
         # After the process was delayed, samples of other sources may still be in the kernel.
-        # Deadlines are therefore applied only at a Tick, which follows after all available data
-        # were read.
+        # Deadlines are therefore applied only at other events, such as a Tick, which follows after
+        # all available data were read.
         outputs += self._advance(complete_only=True)
         return outputs
 

@@ -94,8 +94,7 @@ class LabelMonitor:
         self._hidden: NDArray[np.intp] = np.zeros(0, dtype=np.intp)
         """Columns of the mocap layout whose labels are faulty."""
         self.faults: dict[LabelFault, frozenset[str]] = {}
-        """Body parts of each current fault. Their markers must be visible before the fault can
-        end."""
+        """Body parts whose markers must be visible before the fault can end, by current fault."""
         self.misfits: frozenset[str] = frozenset()
         """Body parts whose markers do not fit for a reason that no fault in `faults` explains."""
 
@@ -131,7 +130,7 @@ class LabelMonitor:
         if self._examination is None:
             if not self._rate.is_due(t_ns):
                 return []
-            # Collect the markers of the clusters in a frame, m, shape (M, 3); NaN where missing.
+            # Collect the M markers of the clusters in a frame, m, shape (M, 3); NaN where missing.
             padded = np.concatenate((frame.markers, np.full((1, 3), np.nan)))
             points = padded[self._columns]
             self._examination = LabelExamination(self._search, t_ns, points)
@@ -156,7 +155,7 @@ class LabelMonitor:
         return [*self._end(t_ns), *self._begin(t_ns)]
 
     def _frames(self, t_ns: int, parts: Iterable[str], span_ns: int) -> list[_Examined]:
-        """Return the recent frames in which all these body parts had visible markers."""
+        """Return the frames of the last `span_ns` in which all `parts` had enough markers."""
         needed = set(parts)
         return [
             one for one in self._examined if t_ns - one.t_ns <= span_ns and needed <= one.fitted
@@ -178,8 +177,8 @@ class LabelMonitor:
             # The new fault replaces earlier faults that explained the same markers.
             for other in [f for f in self.faults if not set(f.markers).isdisjoint(fault.markers)]:
                 del self.faults[other]
-            # Some clusters fit although they are part of the fault. They differ only relative to
-            # adjacent clusters.
+            # A cluster may fit although it is part of the fault, because only its pose relative to
+            # adjacent clusters is wrong.
             bad = sum(not one.refused.keys().isdisjoint(fault.parts) for one in frames)
             parts = frozenset(fault.parts)
             fits = bad < _PRESENT * len(frames)

@@ -28,6 +28,7 @@ RATE_HZ = 20.0
 """Number of camera frames used per second. Joints rotate by a few degrees between two of these
 frames."""
 PUBLISHED_HZ = 1.0
+"""Number of published results per second."""
 MOVED_P = 1e-4
 """Probability of a shift by chance, below which a center is reported as moved.
 
@@ -35,10 +36,11 @@ In one hour with a time constant of 20 s, 180 independent estimates are tested."
 _UNSEEN_SD_M = 1.0
 """Standard deviation along an unobserved direction, m; it exceeds the size of any limb."""
 _SAME_DIRECTION = 0.3
-"""Largest singular value of a direction that counts as observed.
+"""Largest singular value of a direction that counts as observed by both centers.
 
-The singular values belong to the matrix of the directions that either center did not observe. If
-both did not observe nearly the same direction, one singular value is large and the other small."""
+The singular values are those of a matrix. Its rows are the directions that the running center did
+not observe, and those that the calibrated center did not observe. If a row of one center nearly
+equals a row of the other, the two rows have one large and one small singular value."""
 
 
 class MovingCenters:
@@ -173,7 +175,11 @@ class MovingCenters:
 
 
 def _shift_test(fit: CenterEstimate, reference: CalibratedCenter) -> tuple[Array | None, float]:
-    """Return the shift along directions that both centers observed, m, and its probability."""
+    """Return the shift along directions that both centers observed, m, and its chance.
+
+    The chance is the probability of a larger shift by random errors. Without a common direction,
+    the result is None and 1.
+    """
     unseen = np.concatenate((fit.unseen.reshape(-1, 3), np.reshape(reference.unseen, (-1, 3))))
     size, axes = np.linalg.svd(unseen, full_matrices=False)[1:]
     hidden = axes[size > _SAME_DIRECTION]
@@ -188,7 +194,9 @@ def _shift_test(fit: CenterEstimate, reference: CalibratedCenter) -> tuple[Array
 
 
 def chance_of(square: float, freedom: int) -> float:
-    r"""Return the probability that chi-squared with 1 to 3 degrees of freedom exceeds a value.
+    r"""Return the probability that chi-squared with `freedom` degrees of freedom exceeds `square`.
+
+    With x = `square` and 1, 2 or 3 degrees of freedom, the probability is
 
     .. math:: p_1 = \mathrm{erfc}\sqrt{x/2}, \quad p_2 = e^{-x/2}, \quad
               p_3 = p_1 + \sqrt{2x/\pi}\, e^{-x/2}

@@ -49,6 +49,13 @@ class RunningRms:
     r"""Running root mean square with exponentially decreasing weights and time constant T.
 
     .. math:: \mathrm{rms}^2 = \frac{\sum_k w_k x_k^2}{\sum_k w_k}, \qquad w_k = e^{-(t - t_k) / T}
+
+    where x_k is the value that was added at t_k.
+
+    Parameters
+    ----------
+    time_s : float
+        Time constant T, s.
     """
 
     def __init__(self, time_s: float = RMS_TIME_S) -> None:

@@ -19,7 +19,11 @@ if TYPE_CHECKING:
 def chain_tracker(
     rig: Rig, calibration: Calibration | None, before: ChainTracker | None
 ) -> ChainTracker | None:
-    """Return a tracker of the chain model with refined markers; `before` if it is equivalent."""
+    """Return a tracker of the chain model; None if rig.toml requests none.
+
+    The markers are refined if the calibration contains refined markers of this model. The tracker
+    `before` is returned if it is equivalent.
+    """
     if rig.chain_model is None or rig.mqtt.chain_hz <= 0.0:
         return None
     stored = None if calibration is None else calibration.chain
@@ -36,7 +40,7 @@ def chain_tracker(
 
 
 def planar_tracker(rig: Rig, before: PlanarTracker | None) -> PlanarTracker | None:
-    """Return a tracker of a planar rig; `before` if it has the same settings."""
+    """Return a tracker of a planar rig, or `before` if it is equivalent; None for other rigs."""
     if not rig.chain.planar:
         return None
     rates = rig.mqtt.sticks_hz, rig.mqtt.sticks_memory_s
@@ -48,7 +52,10 @@ def planar_tracker(rig: Rig, before: PlanarTracker | None) -> PlanarTracker | No
 def label_monitor(
     rig: Rig, calibration: Calibration | None, before: LabelMonitor | None
 ) -> LabelMonitor | None:
-    """Return a monitor of the marker labels; `before` if it has the same settings."""
+    """Return a monitor of the marker labels, or `before` if it has the same settings.
+
+    The result is None without a calibration, or if a chain model is tracked.
+    """
     # The tracker of a chain model has its own monitor.
     if calibration is None or (rig.chain_model is not None and rig.mqtt.chain_hz > 0.0):
         return None
@@ -64,7 +71,8 @@ def unused_refinement(rig: Rig, calibration: Calibration | None, t_ns: int) -> l
         return []
     text = (
         "the calibration contains refined markers of another version of the chain model "
-        f"({chain.model!r}): those of the file are used. Repeat the functional phase to refine them"
+        f"({chain.model!r}), so the markers of the model file are used. Repeat the functional "
+        "phase to refine them"
     )
     level = NoticeLevel.WARNING
     return [Notice(t_ns, NoticeKind.CALIBRATION, loaded.chain.name, text, level)]

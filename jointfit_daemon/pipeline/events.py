@@ -55,7 +55,8 @@ class SourceOpened:
 class SourceClosed:
     """A driver ended because the device is lost, misconfigured, or removed by a reload.
 
-    The driver is started again only if the device is lost.
+    The driver of a lost device is started again soon, and that of a misconfigured device after a
+    pause. A removed device is not started again.
     """
 
     t_ns: int
@@ -229,7 +230,7 @@ class Notice:
     t_ns: int
     kind: NoticeKind
     id: str
-    """Name of the device, rig or calibration phase."""
+    """Name of the subject, such as a device, a rig, a marker or a calibration phase."""
     text: str
     level: NoticeLevel = NoticeLevel.INFO
     data: Mapping[str, object] = field(default_factory=dict)

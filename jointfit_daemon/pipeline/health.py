@@ -48,7 +48,7 @@ class ClockHealth:
     epoch: int
     """Number of restarts of the clock."""
     offset_ns: int | None
-    """Offset of host time from device time, ns."""
+    """Host time minus device time at the last sample, ns; None if unknown."""
     skew_ppm: float | None
     sigma_ns: float | None
     """Standard deviation of the last stamp, ns."""
@@ -102,7 +102,7 @@ class LagHealth:
     sigma_ns: float | None
     """Standard deviation of the lag in use, ns; None if unknown."""
     found_by: str | None
-    """Method by which the calibration estimated the lag; None if it did not."""
+    """Method by which the calibration estimated the lag; None without such an estimate."""
     tracked: TrackedLag | None
     """Lag estimated during operation."""
     refused: str | None

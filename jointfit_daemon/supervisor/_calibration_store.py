@@ -84,7 +84,9 @@ def calibration_age_s(calibration: Calibration, now: datetime.datetime | None = 
 
 
 def save(rig: Rig, calibration: Calibration, *, keep_date: bool = False) -> int:
-    """Write a new version and return its number. By default, it gets the current date.
+    """Write `calibration` as a new version and return the number of this version.
+
+    The stored calibration gets the current date, unless `keep_date` is true.
 
     Raises
     ------

@@ -14,6 +14,8 @@ from jointfit_daemon.pipeline.events import Tick, UnixOffset
 from jointfit_daemon.units import NS_PER_S
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from jointfit_daemon.outputs.sink import Sink
     from jointfit_daemon.outputs.unix_clock import UnixClock
     from jointfit_daemon.pipeline.events import Event, Output
@@ -39,6 +41,9 @@ class CoreInterface(Protocol):
 
     def feed(self, event: Event) -> list[Output]:
         """Process one event and return its outputs."""
+
+    def descriptions(self) -> Mapping[str, tuple[bytes, ...]]:
+        """Chunks that new decoders of the open sources need before further chunks."""
 
     def health(self, now_ns: int) -> CoreHealth:
         """Return counters and clock estimates."""
@@ -88,7 +93,8 @@ class CoreRunner:
     def _arm(self) -> None:
         """Set the timer for the next tick.
 
-        A timer that is due too early is not changed. When it fires, the deadline is checked again.
+        A timer that is due before the new deadline is not changed. When it fires, the deadline is
+        checked again.
         """
         due_ns = self._fed_ns + LONGEST_TICK_INTERVAL_NS
         deadline_ns = self.core.next_deadline_ns

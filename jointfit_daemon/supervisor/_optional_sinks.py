@@ -48,7 +48,14 @@ def create_recorder(rig: Rig, core: CoreRunner, tasks: TaskGroup, report: Report
     def pass_report(found: RecordingReport) -> None:
         report(NoticeKind.RECORDING, found.text, found.level)
 
-    recorder = Recorder(folder, rig.name, limits, pass_report, autostart=settings.autostart)
+    recorder = Recorder(
+        folder,
+        rig.name,
+        limits,
+        pass_report,
+        autostart=settings.autostart,
+        describe=core.core.descriptions,
+    )
     if settings.autostart:
         log.info("recording in %s", folder)
     core.subscribe(recorder)

@@ -6,8 +6,8 @@ delayed until the source can no longer be closed because of this silence. If the
 data, it is not closed, and the line is written. A stall of the host has its own line. After a
 stall, the lines are delayed until the sensors may have recovered.
 
-Invariant: the line about a lost sensor is written within `LONGEST_S`, even if the host stalls
-continuously.
+Invariant: if its source stays open, the line about a lost sensor is written within `LONGEST_S`,
+even if the host stalls continuously.
 """
 
 from __future__ import annotations

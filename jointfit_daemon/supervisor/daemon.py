@@ -143,7 +143,7 @@ class Daemon:
         self._overload = OverloadMonitor()
         self._recorder: Recorder | None = None
         self._state_fault: str | None = None
-        # None if the folder was writable at the start: this process has locked it already.
+        # None if the folder was writable at the start, because it is then locked already.
         self._state_lock: int | None = None
         self._calibration: CalibrationStatus | None = None
         self._health_due_s = 0.0
@@ -173,7 +173,10 @@ class Daemon:
             log.error("mqtt: all requests are refused: %s", self._authenticator.fault)
 
     async def _move_to_broker(self, before: Rig, rig: Rig) -> None:
-        """Disconnect from the old broker, and send all retained messages to the new one."""
+        """Disconnect from the old broker, and send the retained messages to the new broker.
+
+        Topics below ``bridge/`` are omitted, because they are published again.
+        """
         await self._link.flush(FAREWELL_S)  # includes messages that clear a topic
         await stop([self._mqtt])
         known = self._outbox.retained
@@ -244,8 +247,8 @@ class Daemon:
     async def _check_state(self, *, asked: bool = True) -> None:
         """Report a state directory without write access, before a calibration must be stored.
 
-        `asked` states that a request or a reload caused the check. Otherwise only changes are
-        reported.
+        If `asked`, the cause of the check is the start, a request or a reload. Otherwise only
+        changes are reported.
         """
         folder = store_directory(self._rig)
         before, fault = self._state_fault, await asyncio.to_thread(write_fault, folder)

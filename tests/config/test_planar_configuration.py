@@ -62,7 +62,7 @@ def test_inner_segments_need_two_markers_and_ends_one(rig: Table) -> None:
 def test_sensors_bodies_models_and_missing_cameras_are_refused(rig: Table) -> None:
     rig["imu"] = [{"id": "S1", "segment": "thigh", "driver": "fake", "port": "/dev/nowhere"}]
     assert refusals(rig) == [
-        "imu: expected none with chain.motion = planar, which cameras alone follow: remove one"
+        "imu: expected none with chain.motion = planar, which needs cameras only: remove one key"
     ]
     del rig["imu"]
     rig["mocap"]["rigid_body"] = {"shank": "Shank"}

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
+import sys
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 
+from jointfit_daemon.files.mocap import read_trc
 from jointfit_daemon.outputs.payload_models import ANSWERS
 from tests.payload_check import payload_fault
 from tests.system.station import PATIENCE_S, Listener, Station, running
@@ -64,3 +68,27 @@ async def test_payloads_and_answers_of_a_running_daemon_fit_their_models(
         await listener.until(lambda: seen >= expected)
         await listener.health()
     assert misfits == {}
+
+
+async def test_a_recording_that_starts_later_contains_the_markers(
+    tmp_path: Path, broker: Broker
+) -> None:
+    """The daemon received the list of marker names before the recording began."""
+    async with running(Station(tmp_path, broker.port)) as (_, _, listener):
+        await listener.connected(("S1", "S2", "S3", "S4", "mocap"))
+        assert listener.client is not None
+        await listener.client.request("record", {"action": "start"})
+        await asyncio.sleep(2.0)
+        answer = await listener.client.request("record", {"action": "stop"})
+        assert answer["status"] == "ok", answer
+    export = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "jointfit_daemon.tools", "export", "--to", "trc"),
+        *(answer["data"]["directory"], "--out", str(tmp_path / "exported")),
+        stderr=asyncio.subprocess.PIPE,
+    )
+    _, errors = await export.communicate()
+    assert export.returncode == 0, errors.decode()
+    (path,) = (tmp_path / "exported").glob("*.trc")
+    markers = read_trc(path)
+    assert len(markers.positions) > 100
+    assert np.isfinite(markers.positions).mean() > 0.9

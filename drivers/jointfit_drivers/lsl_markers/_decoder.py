@@ -69,6 +69,7 @@ class LslMarkersDecoder:
         self._place, self._turn = world_rotation(settings.up_axis)
         self._description: StreamDescription | None = None
         self._layout: StreamLayout | None = None
+        self._described: bytes | None = None
         self._binding: ColumnBinding | None = None
         self._unit_check = UnitCheck("m")
         self._number = 0
@@ -97,6 +98,11 @@ class LslMarkersDecoder:
         """Number of bytes so far that belong to no chunk."""
         return self._codec.discarded
 
+    @property
+    def description(self) -> tuple[bytes, ...]:
+        """Chunk with the newest description of the stream."""
+        return () if self._described is None else (self._described,)
+
     def feed(self, chunk: Chunk) -> list[Decoded]:
         """Return the frames, echoes and events of `chunk`; never raise."""
         out: list[Decoded] = []
@@ -109,6 +115,7 @@ class LslMarkersDecoder:
                 case CorruptBytes():
                     out.append(Corrupt(message.discarded, message.reason))
                 case _:
+                    self._described = chunk.data
                     self._bind_channels(message, out)
         self.unpublished = self._codec.undescribed
         return out

@@ -65,6 +65,7 @@ class NatNetDecoder:
         self._info: natnet.ServerInfo | None = None
         self._hz: int | None = None
         self._binding: Binding | None = None
+        self._described: dict[str, bytes] = {}
         self._asked: dict[int, int] = {}
         self._announced = 0
         self._live = self._stamped = True
@@ -89,6 +90,12 @@ class NatNetDecoder:
         if self._time.precise:
             return self._time.tick_clock
         return TickClock(0, None, self._hz) if self._hz else None
+
+    @property
+    def description(self) -> tuple[bytes, ...]:
+        """Newest messages with the server, its bitstream version and its model list."""
+        parts = ("server", "bitstream", "model")
+        return tuple(self._described[part] for part in parts if part in self._described)
 
     @property
     def duplicates(self) -> int:
@@ -131,8 +138,10 @@ class NatNetDecoder:
             case natnet.FrameOfData():
                 self._frame(chunk, message, out)
             case natnet.ServerInfo() if message != self._info:
+                self._described = {"server": chunk.data}
                 self._server(message, out)
             case natnet.ModelDefinition():
+                self._described["model"] = chunk.data
                 self._model(message, out)
             # The capture contains an echo request of a client. Its arrival is the sending time.
             case natnet.EchoRequest(stamp):
@@ -144,6 +153,7 @@ class NatNetDecoder:
             case natnet.CommandResponse():
                 version = bitstream_response(message.text)
                 if version is not None:
+                    self._described["bitstream"] = chunk.data
                     self._bitstream.confirm(version)
 
     # --- server and model ---------------------------------------------------------------------

@@ -63,6 +63,7 @@ class QtmDecoder:
         self._parts = FrameParts()
         self._newer = NewerFirmwareDetector(tool="QTM", sightings=1)
         self._settings: qtm.QtmSettingsXml | None = None
+        self._described: dict[str, bytes] = {}
         self._binding: QtmBinding | None = None
         self._clock: TickClock | None = None
         self._clock_before: TickClock | None = None
@@ -84,6 +85,11 @@ class QtmDecoder:
     def tick_clock(self) -> TickClock | None:
         """Camera time if QTM streams it; otherwise time since the beginning of the measurement."""
         return self._clock
+
+    @property
+    def description(self) -> tuple[bytes, ...]:
+        """Newest packets with the version and the settings of QTM."""
+        return tuple(self._described.values())
 
     @property
     def duplicates(self) -> int:
@@ -109,6 +115,7 @@ class QtmDecoder:
                 for frame in self._parts.add(chunk.t_ns, message):
                     self._frame(frame, out)
             case qtm.SettingsReply(xml):
+                self._described["settings"] = chunk.data
                 self._take_settings(xml, out)
             case qtm.Event(number):
                 self._event(number, out)
@@ -119,6 +126,7 @@ class QtmDecoder:
                 text = "no measurement is running: waiting for QTM"
                 out.append(DeviceEvent("setting", text, {"waiting": True}))
             case qtm.Command(text) if text.lower().startswith(_VERSION_ANSWER):
+                self._described["version"] = chunk.data
                 version = text[len(_VERSION_ANSWER) :]
                 data = {"model": "QTM", "protocol": version, "transport": "tcp"}
                 out.append(DeviceEvent("info", f"QTM, real-time protocol {version}", data))

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chunk, Decoded
     from jointfit_drivers.vicon._binding import ViconBinding
     from jointfit_drivers.vicon._settings import ViconSettings
-    from jointfit_protocols.vicon import Object
 
 _CLOCK = TickClock(0, None, vicon.TICKS_PER_S)
 _LONGEST_PERIOD = 10 * vicon.TICKS_PER_S
@@ -61,6 +60,8 @@ class ViconDecoder:
         self._newer = NewerFirmwareDetector(tool="the Vicon software", sightings=1)
         self._continuity = FrameContinuity()
         self._latency = AnnouncedLatency()
+        self._described: dict[frozenset[type], bytes] = {}
+        """Newest packet with each combination of static objects."""
         self._binding: ViconBinding | None = None
         self._period: int | None = None
         self._poor: set[int] = set()
@@ -79,6 +80,11 @@ class ViconDecoder:
     def tick_clock(self) -> TickClock | None:
         """Ticks of 1/135 000 000 s; None until the frame period is known."""
         return None if self._period is None else _CLOCK
+
+    @property
+    def description(self) -> tuple[bytes, ...]:
+        """Newest packets with the static objects, such as subjects and frame period."""
+        return tuple(self._described.values())
 
     @property
     def duplicates(self) -> int:
@@ -113,7 +119,10 @@ class ViconDecoder:
             elif isinstance(item, vicon.OpaqueObject) and item.id in vicon.OPTIONAL:
                 content = f"object {item.id} in a shorter layout"
                 out += self._newer.take_unknown(content, chunk.t_ns)
-        self._take_static(packet.objects, out)
+        static = frozenset(type(item) for item in packet.objects if isinstance(item, _STATIC_TYPES))
+        if static:
+            self._described[static] = chunk.data
+            self._take_static(out)
         number = _first(packet.objects, vicon.FrameInfo)
         if number is not None:
             self._frame(chunk, number.number, out)
@@ -125,10 +134,8 @@ class ViconDecoder:
 
     # --- static objects -----------------------------------------------------------------------
 
-    def _take_static(self, objects: Iterable[Object], out: list[Decoded]) -> None:
+    def _take_static(self, out: list[Decoded]) -> None:
         """Append the changes of subjects, axis, period and quality."""
-        if not any(isinstance(item, _STATIC_TYPES) for item in objects):
-            return
         application = _first(self._state.static(ObjectId.APPLICATION_INFO), vicon.ApplicationInfo)
         axis = "y" if application is not None and application.orientation == _Y_UP else "z"
         if self._up_axis == "auto" and axis != self._axis:

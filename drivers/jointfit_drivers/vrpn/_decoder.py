@@ -33,6 +33,8 @@ from jointfit_protocols import vrpn
 from jointfit_protocols.corrupt import CorruptBytes
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from jointfit_daemon.model import Chunk, Decoded, Quaternion, Vector
     from jointfit_drivers.motion_capture import ColumnKey
     from jointfit_drivers.vrpn._settings import VrpnSettings
@@ -51,6 +53,9 @@ _FARTHEST_M = 1_000.0
 visible."""
 _MOST_BODIES = 2000
 """Largest number of bodies per server. Further bodies are dropped, because each takes memory."""
+_DESCRIBING = (vrpn.Cookie, vrpn.SenderDescription, vrpn.TypeDescription)
+_MOST_DESCRIBED_BYTES = 1_000_000
+"""Largest size of the kept chunks that describe the connection, bytes."""
 _NEWEST = NewestKnown((vrpn.MAJOR, vrpn.MINOR), "the camera software", "VRPN")
 _CLOCKS = {"server": TickClock(1000, None), "utc": TickClock(1000, None, None, "unix")}
 
@@ -75,6 +80,7 @@ class VrpnDecoder:
         self._unit_check = UnitCheck(settings.unit)
         self._bodies: dict[tuple[str, int], None] = {}
         """Bodies that have sent a report, in the order of their first report."""
+        self._described: list[bytes] = []
         self._binding: ColumnBinding | None = None
         self._stale_binding = True
         self._settled = False
@@ -117,7 +123,10 @@ class VrpnDecoder:
     def feed(self, chunk: Chunk) -> list[Decoded]:
         """Return the frames that `chunk` completes, and events; never raise."""
         out: list[Decoded] = []
-        for message in self._codec.feed(chunk.data):
+        messages = self._codec.feed(chunk.data)
+        if any(isinstance(message, _DESCRIBING) for message in messages):
+            self._keep_description(chunk.data, messages)
+        for message in messages:
             match message:
                 case vrpn.TrackerPose():
                     self._report(message, chunk.t_ns, out)
@@ -140,6 +149,17 @@ class VrpnDecoder:
                 case vrpn.Disconnect():
                     out.append(DeviceEvent("info", "the server ended the connection"))
         return out
+
+    def _keep_description(self, data: bytes, messages: Iterable[object]) -> None:
+        if any(isinstance(message, vrpn.Cookie) for message in messages):
+            self._described = []
+        if sum(map(len, self._described)) + len(data) <= _MOST_DESCRIBED_BYTES:
+            self._described.append(data)
+
+    @property
+    def description(self) -> tuple[bytes, ...]:
+        """Chunks with the cookie of the connection and the names of senders and types."""
+        return tuple(self._described)
 
     def flush(self) -> list[Decoded]:
         """Return the unfinished frame, and discard an incomplete message."""

@@ -151,7 +151,11 @@ def _require_header(path: Path, lines: Sequence[str]) -> None:
 
 
 def write_trc(path: Path, trajectories: MarkerTrajectories) -> None:
-    """Write a TRC file in metres: tabs, 8 significant digits, empty cells for missing markers."""
+    """Write a TRC file in metres: tabs, 8 significant digits, empty cells for missing markers.
+
+    Every data row ends with a tab. Otherwise OpenSim 4.6 rejects a row whose last marker is missing,
+    because it discards the last empty cell.
+    """
     count, markers = len(trajectories.t_s), len(trajectories.names)
     rate = format_value(trajectories.rate_hz)
     first = int(trajectories.frames[0]) if count else 1
@@ -168,5 +172,6 @@ def write_trc(path: Path, trajectories: MarkerTrajectories) -> None:
     ]
     flat = trajectories.positions.reshape(count, -1)
     for frame, t_s, cells in zip(trajectories.frames, trajectories.t_s, flat, strict=True):
-        rows.append("\t".join([str(int(frame)), format_instant(t_s), *map(format_value, cells)]))
+        values = [str(int(frame)), format_instant(t_s), *map(format_value, cells)]
+        rows.append("\t".join([*values, ""]))
     path.write_text("\n".join(rows) + "\n", encoding="utf-8")

@@ -49,7 +49,7 @@ def printable_data(data: Any, depth: int = 0) -> Any:
 
 
 class PrintableRecord(logging.LogRecord):
-    """A log record whose further lines are indented behind a bar, so that none imitates an entry.
+    """A log record whose further lines begin with a bar, so that no line imitates a log entry.
 
     The class is installed by ``logging.setLogRecordFactory``, so all handlers use it.
     """

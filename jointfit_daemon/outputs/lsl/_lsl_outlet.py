@@ -46,7 +46,7 @@ class LslOutlet:
     rig
         Name of the rig.
     rate_hz
-        Rate of the frames.
+        Rate of the frames, Hz.
     """
 
     def __init__(self, settings: LslSettings, rig: str, rate_hz: float) -> None:

@@ -185,7 +185,7 @@ def _calibration(health: BridgeHealth, frames: FrameStatistics) -> Iterator[Metr
     yield version
     created = GaugeMetricFamily(
         "jointfit_calibration_created_timestamp_seconds",
-        "UNIX time of the calibration in force; its age is time() minus this.",
+        "UNIX time of the calibration in force; its age is time() minus this value.",
     )
     if health.core.version is not None and frames.calibrated_s is not None:
         created.add_metric([], frames.calibrated_s)

@@ -1,4 +1,4 @@
-"""Two statistics that are no health counters: the latency of frames, and the calibration date.
+"""Two statistics that are not health counters: latency of frames, and date of the calibration.
 
 A frame costs one search in a table of twelve limits, and no allocation of memory.
 """

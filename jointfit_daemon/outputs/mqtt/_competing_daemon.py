@@ -55,10 +55,10 @@ class TakeoverDetector:
     def suspects(self, lasted_s: float, *, taken_over: bool) -> bool:
         """Return whether an older daemon probably ended the last connection.
 
-        The n-th consecutive short connection raises the suspicion if the broker gave a reason.
-        Without a reason, the (n + 2)-th does. The first connection must have been shorter than
-        ``NEWCOMER_S * 2**(n - 1)``. An established daemon counts as connected for `SHORT_S`, so
-        that one of two established daemons also gives way.
+        The result is True after n consecutive short connections if the broker gave the reason for
+        the last loss, and after n + 2 otherwise. In addition, the first connection must have been
+        shorter than ``NEWCOMER_S * 2**(n - 1)``. The first connection of an established daemon
+        counts as `SHORT_S` long, so that one of two established daemons also gives way.
 
         Parameters
         ----------

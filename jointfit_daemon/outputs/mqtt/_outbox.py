@@ -125,7 +125,10 @@ class Outbox:
         self._push(self._events, _EVENT_CAPACITY, message)
 
     def respond(self, topic: str, payload: bytes, *, correlation: bytes | None = None) -> None:
-        """Add the response to a request. It is sent before all other messages, with QoS 1."""
+        """Add the response to a request. It is sent before all other messages, with QoS 1.
+
+        `correlation` is the correlation data that the client sent with its request (MQTT 5).
+        """
         message = Outgoing(topic, payload, 1, False, RESPONSE_EXPIRY_S, None, correlation)
         self._push(self._responses, _EVENT_CAPACITY, message)
 

@@ -72,7 +72,7 @@ class PacketLimitSocket:
         Raises
         ------
         BlockingIOError
-            No byte is available yet.
+            No byte is available yet, or the limit of dropped data per iteration was reached.
         """
         if not self._ready and not self._body_bytes and not self._find_packet():
             return b""

@@ -197,14 +197,15 @@ class MqttPublisher:
                 reason = str(error)
             stop_if_cancelled()
 
-            # A daemon that was connected before reconnects at once; see `TakeoverDetector`.
+            # After a connection of at least `NEWCOMER_S`, the daemon reconnects at once; see
+            # `TakeoverDetector`.
             lasted_s, self._lasted_s = self._lasted_s, 0.0
             if lasted_s >= NEWCOMER_S:
                 delay_s = _FIRST_RETRY_S
 
             try:
-                # A takeover closes the connection. A broker that does not answer is therefore no
-                # takeover.
+                # A takeover closes the connection. A missing answer of the broker is therefore not
+                # caused by a takeover.
                 silent = NO_ANSWER in reason
                 if silent or not await self._pause_if_competing(lasted_s):
                     self._report_loss(reason, lasted_s)
@@ -217,10 +218,10 @@ class MqttPublisher:
             delay_s = min(2 * delay_s, _LAST_RETRY_S)
 
     async def flush(self, within_s: float, *, streams: bool = False) -> None:
-        """Wait until the broker has accepted all state and events, for at most `within_s`.
+        """Wait until the broker has accepted responses, state and events, at most `within_s`.
 
-        The method returns at once without a connection. With `streams`, it also waits until all
-        stream messages are sent.
+        If the daemon is not connected, the method returns at once. With `streams`, it also waits
+        until all other messages are sent.
         """
         until, outbox = self._loop.time() + within_s, self._outbox
         while self.connected and self._loop.time() < until:
@@ -237,7 +238,10 @@ class MqttPublisher:
         )
 
     async def _pause_if_competing(self, lasted_s: float) -> bool:
-        """Leave the client id to the daemon that used it first, and wait until that daemon ends."""
+        """If an older daemon uses the client id, wait until it ends; return whether this happened.
+
+        The client id belongs to the daemon that used it first.
+        """
         if not self._takeovers.suspects(lasted_s, taken_over=self._taken_over):
             return False
         if not (self._taken_over or await is_publishing(self._settings, GLANCE_S)):

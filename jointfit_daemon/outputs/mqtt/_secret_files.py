@@ -26,11 +26,14 @@ _OTHERS = stat.S_IROTH | stat.S_IWOTH
 
 
 class RequestKeyError(Exception):
-    """Requests must be signed, but the key to verify them is missing or too short."""
+    """Requests must be signed, but the key is missing or too short."""
 
 
 def password_of(settings: MqttSettings) -> str | None:
-    """Return the password from `password_file` or the systemd credential; None if there is none."""
+    """Return the password from `password_file` or the systemd credential.
+
+    The result is None if there is no password, or if the file cannot be read.
+    """
     path = _password_path(settings)
     if path is None:
         return None

@@ -59,7 +59,7 @@ def tls_context(tls: TlsSettings) -> ssl.SSLContext:
     try:
         context = ssl.create_default_context(cafile=tls.ca)
     except ssl.SSLError as error:
-        raise TlsFilesError(f"ca = {tls.ca}: holds no certificate in PEM") from error
+        raise TlsFilesError(f"ca = {tls.ca}: contains no certificate in PEM") from error
     context.sslsocket_class = _ClosingTlsSocket
     context.minimum_version = ssl.TLSVersion.TLSv1_2
 
@@ -89,8 +89,9 @@ def tls_remedy(
         Table ``[mqtt]``.
     established
         Whether the client completed its part of the handshake. With TLS 1.3, the broker verifies
-        the client's certificate only then. If it closes or resets the connection after that, it
-        rejected the certificate. After a reset, the client does not receive the broker's alert.
+        the client's certificate only then. If the broker closes or resets the connection after
+        that, it rejected the certificate. After a reset, the client does not receive the broker's
+        alert.
     """
     if isinstance(error, ssl.SSLCertVerificationError):
         return f" ({_verification_remedy(error, settings)})"

@@ -89,7 +89,10 @@ def payload_schema(topic: Topic) -> dict[str, Any]:
 
 
 def answer_schema(request: str) -> dict[str, Any]:
-    """Return the JSON Schema (2020-12) of the answer to a request; ``data`` is empty in errors."""
+    """Return the JSON Schema (2020-12) of the answer to a request.
+
+    In an answer that reports an error, ``data`` is empty.
+    """
     schema, data = payload_schema(topics.RESPONSE), _open(ANSWERS[request].model_json_schema())
     definitions = data.pop("$defs", {}) | {data["title"]: data}
     schema["title"] = f"{data['title']}Message"
@@ -100,7 +103,10 @@ def answer_schema(request: str) -> dict[str, Any]:
 
 
 def payload_topic(name: str) -> Topic | None:
-    """Return the topic of a name below the base, such as ``joint/knee``; None for requests."""
+    """Return the topic of a name below the base, such as ``joint/knee``.
+
+    The result is None for requests and for unknown names.
+    """
     levels = name.split("/")
     for topic in PAYLOADS:
         pattern = topic.pattern.split("/")

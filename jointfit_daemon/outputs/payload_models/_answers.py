@@ -49,8 +49,8 @@ class OnlineRefit(Table):
 
     rounds: int = Field(description="number of accepted refits since the functional phase")
     from_version: int | None
-    before_deg: dict[str, Number] = Field(description="by segment and joint, models before")
-    after_deg: dict[str, Number] = Field(description="by segment and joint, these models")
+    before_deg: dict[str, Number] = Field(description="errors before, by segment and joint")
+    after_deg: dict[str, Number] = Field(description="errors after, by segment and joint")
 
 
 class StoredVersion(Table):
@@ -127,8 +127,8 @@ class PhysicalTestOutcome(Table):
         description="angle of each measured rotation from the requested one"
     )
     found: str = Field(description="convention of the quaternions as received, in words")
-    rig_toml: list[str] = Field(description="lines of its [[imu]] table that correct the reading")
-    alternatives: list[str] = Field(description="other lines, with another heading")
+    rig_toml: list[str] = Field(description="lines of the sensor's [[imu]] table that correct it")
+    alternatives: list[str] = Field(description="equally good lines, with another heading")
     lines: list[str] = Field(description="the outcome in words")
 
 

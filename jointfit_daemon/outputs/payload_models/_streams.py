@@ -78,7 +78,7 @@ class PoseJoint(AnglesAndRates):
 class Pose(Payload):
     """``pose`` and ``pose/ui``."""
 
-    seq: int = Field(description="number of the frame; the source skips no number")
+    seq: int = Field(description="number of the frame; increases by 1 with every frame")
     t_us: Time
     completed_us: Time
     mono_us: int

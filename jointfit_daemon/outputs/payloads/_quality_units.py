@@ -14,7 +14,7 @@ from typing import Any
 _CONVERTED = {"_rad": ("_deg", 180.0 / math.pi), "_ns": ("_ms", 1e-6)}
 """Conversion by suffix of the key in the core: suffix on MQTT, and factor."""
 _TABLES = {"segments": "segments_rad", "flexion": "flexion_rad"}
-"""Tables in ``holdout`` whose values by method are in radians, per segment or joint."""
+"""Tables in ``holdout`` with the error of each method, rad, for each segment or joint."""
 _PARAMETERS = ("sensors", "regression")
 """Tables of quaternions and coefficients, which are published with all digits. With four digits,
 orientations computed from them would have an error of about 0.1 degrees."""

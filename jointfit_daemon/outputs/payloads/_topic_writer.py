@@ -270,7 +270,10 @@ class TopicWriter:
         self._publish(topics.BRIDGE_HEALTH, self._encode_stamped(payload, self._clock.now_ns()))
 
     def publish_log_line(self, level: str, name: str, text: str, suppressed: int) -> None:
-        """Publish one log line on ``bridge/log``."""
+        """Publish one log line on ``bridge/log``.
+
+        `suppressed` is the number of lines that were omitted since the preceding published line.
+        """
         line = {"level": level, "logger": name, "text": text, "suppressed": suppressed}
         self._publish(topics.BRIDGE_LOG, self._encode_stamped(line, self._clock.now_ns()))
 

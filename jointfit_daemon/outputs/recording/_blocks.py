@@ -35,7 +35,7 @@ _RECORD_START = re.compile(
 )
 """Pattern of the start of a compressed chunk, or of a recording's metadata."""
 _LONGEST_START = 64
-"""Number of bytes that is larger than every match of `_RECORD_START`."""
+"""Number of bytes, larger than the length of every match of `_RECORD_START`."""
 _WINDOW_BYTES = 1024 * 1024
 """Number of bytes that are searched in one step."""
 _MOST_WASTED_RATIO = 20
@@ -75,7 +75,7 @@ class AttachmentBlock(NamedTuple):
 
 
 class DamagedBlock(NamedTuple):
-    """A range of bytes that belong to no record."""
+    """A range of bytes that contains no readable record."""
 
     start: int
     end: int
@@ -92,7 +92,7 @@ Block: TypeAlias = ChunkBlock | MetadataBlock | AttachmentBlock | DamagedBlock |
 
 
 class _DamageError(ValueError):
-    """A record is damaged. The error occurred after `read_bytes` bytes of its content."""
+    """A record is damaged. Before the error, `read_bytes` bytes of its content were read."""
 
     def __init__(self, text: str, read_bytes: int = 0) -> None:
         super().__init__(text)
@@ -105,7 +105,7 @@ def read_blocks(path: Path) -> Iterator[Block]:
     Raises
     ------
     RecordingError
-        The file is not a recording of jointfitd.
+        The file is not a recording of jointfitd, or is damaged in too many places.
     OSError
         The file cannot be read.
     """

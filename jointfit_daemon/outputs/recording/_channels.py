@@ -5,7 +5,8 @@ source/ID       one chunk of a source, as it arrived                 bytes
 event/KIND      every other input event of the core                  JSON
 output/KIND     outputs of the core: `OUTPUT_KINDS`                  JSON
 daemon/KIND     health and notices of the daemon outside the core    JSON
-snapshot/KIND   events that restore the state at the start of a file or after a gap
+snapshot/KIND   events that restore the state at the start of a file or after a gap; KIND can be
+                source/ID, for the chunks that describe the data of a source
 recording/gap   messages that could not be written to the disk
 """
 
@@ -95,7 +96,7 @@ class ChannelForm(NamedTuple):
 
 def channel_form(channel: str) -> ChannelForm:
     """Return the description of the channel with this name."""
-    if channel.startswith(SOURCE):
+    if channel.removeprefix(SNAPSHOT).startswith(SOURCE):
         return ChannelForm("application/octet-stream", "", {**_CLOCK, "stamp_means": _CHUNK_STAMP})
     kind = channel.removeprefix(SNAPSHOT).removeprefix(EVENT)
     stamp = _STAMPS.get(channel, _PROCESSED)
@@ -116,7 +117,7 @@ _STAMPS = {
 
 
 def schema_of(name: str) -> bytes:
-    """Return the JSON Schema with the name `ChannelForm.schema`."""
+    """Return the JSON Schema of a channel; `name` is the attribute `ChannelForm.schema`."""
     kind = name.removeprefix("jointfit.")
     fields = {key: _TYPES[letter] for key, letter in _FIELDS.get(kind, {}).items()}
     required = [key for key, letter in _FIELDS.get(kind, {}).items() if letter.islower()]

@@ -57,7 +57,7 @@ class RecordingInfo:
         Raises
         ------
         ValueError
-            A key is missing or has another type.
+            The checksum is wrong, or a key is missing or has another type.
         """
         values = {key: orjson.loads(text) for key, text in unseal(given).items()}
         kinds = {"session": str, "rig": str, "software": str, "began_with_daemon": bool}

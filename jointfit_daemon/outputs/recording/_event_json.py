@@ -104,7 +104,7 @@ def decode_event(kind: str, data: bytes) -> UnchunkedEvent:
     DamagedEventError
         The content cannot be converted to an event.
     ConfigError
-        The rig of the recording cannot be loaded (a driver is missing).
+        The rig of the recording cannot be loaded, for example because a driver is missing.
     """
     try:
         return _event(kind, orjson.loads(data))

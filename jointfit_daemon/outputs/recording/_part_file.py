@@ -111,7 +111,11 @@ class PartFile:
         return self._buffer.unwritten_bytes
 
     def add(self, channel: str, log_ns: int, publish_ns: int, sequence: int, data: bytes) -> None:
-        """Add one message; the stamps are CLOCK_MONOTONIC ns."""
+        """Add one message.
+
+        `log_ns` is its arrival, and `publish_ns` the instant to which its content refers, both
+        CLOCK_MONOTONIC ns. `sequence` is the number of the message in the session.
+        """
         number = self._channels.get(channel) or self._register(channel)
         offset_ns = self.info.unix_offset_ns
         self._writer.add_message(
@@ -160,7 +164,8 @@ class PartFile:
         Raises
         ------
         OSError
-            The end was not written; the file keeps the suffix of an unfinished file.
+            The end was not written, so the file keeps the suffix of an unfinished file. If only
+            the folder could not be written to the disk, the file has its final name.
         """
         try:
             self._writer.flush()

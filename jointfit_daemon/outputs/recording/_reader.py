@@ -1,4 +1,4 @@
-"""Reader of recordings, including damaged recordings and those of a crashed or running daemon.
+"""Reader of recordings, including damaged ones and recordings of a crashed or running daemon.
 
 Invariant: messages are returned in the order in which the daemon processed them. Each missing
 message is part of exactly one `RecordingGap`.
@@ -83,9 +83,11 @@ class RecordedMessage(NamedTuple):
         RecordingError
             The content cannot be converted to an event.
         ConfigError
-            The rig of the recording cannot be loaded (a driver is missing).
+            The rig of the recording cannot be loaded, for example because a driver is missing.
         """
         prefix, name = _channel_parts(self.channel)
+        if prefix == SNAPSHOT and name.startswith(SOURCE):
+            prefix, name = SOURCE, name.removeprefix(SOURCE)
         if prefix == SOURCE:
             return ChunkArrived(name, Chunk(self.t_ns, self.data))
         if prefix in {EVENT, SNAPSHOT}:
@@ -244,6 +246,8 @@ class Recording:
 
         Raises
         ------
+        RecordingError
+            A file is damaged in too many places.
         OSError
             A file cannot be read.
         """
@@ -257,7 +261,10 @@ class Recording:
                     yield from sequencer.follow(item)
 
     def events(self) -> Iterator[Event]:
-        """Yield the input events of the core in order; the errors are those of `messages`."""
+        """Yield the input events of the core in order.
+
+        The errors are those of `messages` and of `RecordedMessage.event`.
+        """
         for message in self.messages():
             if isinstance(message, RecordedMessage):
                 event = message.event()
@@ -446,6 +453,8 @@ def read_events(path: Path) -> Iterator[Event]:
     ------
     RecordingError
         The file is not a recording, was written by a later version, or contains a damaged event.
+    ConfigError
+        The rig of the recording cannot be loaded, for example because a driver is missing.
     OSError
         The file cannot be read.
     """

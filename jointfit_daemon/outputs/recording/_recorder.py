@@ -29,7 +29,7 @@ from jointfit_daemon.outputs.recording._snapshot import SNAPSHOT_TYPES, Snapshot
 from jointfit_daemon.pipeline.events import CalibrationReady, ChunkArrived, NoticeLevel
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
     from jointfit_daemon.pipeline.events import Event, Output
@@ -86,6 +86,9 @@ class Recorder:
         Function that is called at each interruption and resumption of writing.
     autostart
         Whether recording starts with the first event.
+    describe
+        Function that returns the chunks that new decoders of the open sources need before further
+        chunks, by source.
     """
 
     def __init__(
@@ -96,8 +99,9 @@ class Recorder:
         report: Callable[[RecordingReport], None] = lambda _: None,
         *,
         autostart: bool = True,
+        describe: Callable[[], Mapping[str, tuple[bytes, ...]]] = dict,
     ) -> None:
-        self._directory, self._name = directory, name
+        self._directory, self._name, self._describe = directory, name, describe
         self._limits = limits or RecordingLimits()
         self._report = report
         self._writing = asyncio.Lock()
@@ -123,9 +127,9 @@ class Recorder:
         self._gap: RecordingGap | None = None
 
     def begin(self, *, with_daemon: bool = False) -> SessionWriter:
-        """Start recording. The next write creates the file."""
+        """Start recording and return the writer. The next write creates the file."""
         self._clear()
-        self._before = self._snapshot
+        self._before = replace(self._snapshot, descriptions=self._describe())
         self._began_s = time.monotonic()
         writer = SessionWriter(self._directory, self._name, with_daemon, self._limits)
         self._writer = writer
@@ -304,11 +308,12 @@ class Recorder:
     def _take(self) -> Batch:
         """Return the waiting messages, and begin to collect again."""
         messages, before, gap = self._pending, self._before, self._gap
-        self._pending, self._pending_bytes, self._before = [], 0, self._snapshot
+        self._pending, self._pending_bytes = [], 0
+        self._before = replace(self._snapshot, descriptions=self._describe())
         batch = Batch(self._first_sequence, messages, before, self._snapshot, gap)
         self._first_sequence = batch.next_sequence
 
-        # Messages above the limit come after this batch and before the next batch.
+        # Messages that exceeded the limit belong between this batch and the next batch.
         self._gap = None
         if self._lost:
             now_ns = time.monotonic_ns()

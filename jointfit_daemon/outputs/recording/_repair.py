@@ -146,7 +146,7 @@ def _copy(
 
 @contextmanager
 def _lock_file(source: Path) -> Iterator[None]:
-    """Raise an error if a daemon is writing the file."""
+    """Lock the file during the ``with`` block; raise RecordingError if a daemon is writing it."""
     fd = os.open(source, os.O_RDONLY | os.O_CLOEXEC)
     try:
         try:

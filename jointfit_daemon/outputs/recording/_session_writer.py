@@ -354,8 +354,11 @@ class SessionWriter:
 
     def _add_snapshot(self, part: PartFile, snapshot: Snapshot, sequence: int) -> None:
         for event in snapshot.events(self._now_ns):
-            channel = SNAPSHOT + EVENT_KINDS[type(event)]
-            part.add(channel, self._now_ns, self._now_ns, sequence, encode_event(event))
+            if isinstance(event, ChunkArrived):
+                channel, data = SNAPSHOT + SOURCE + event.source, event.chunk.data
+            else:
+                channel, data = SNAPSHOT + EVENT_KINDS[type(event)], encode_event(event)
+            part.add(channel, self._now_ns, self._now_ns, sequence, data)
 
     # --- losses ------------------------------------------------------------------------------
 

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING
 
 import orjson
 
+from jointfit_daemon.model import Chunk
 from jointfit_daemon.outputs.recording._event_json import encode_json
 from jointfit_daemon.outputs.recording._part_file import RecordedAttachment
 from jointfit_daemon.pipeline.events import (
     CalibrationReady,
     CalibrationSelected,
     CalibrationStored,
+    ChunkArrived,
     Configured,
     SourceClosed,
     SourceOpened,
@@ -29,7 +31,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """Configuration, calibration, open sources and UNIX time offset at one instant."""
+    """Configuration, calibration, open sources and UNIX time offset at one instant.
+
+    The chunks that describe the data of the sources, such as lists of marker names, are included.
+    """
 
     configured: Configured | None = None
     """The configuration and the current calibration."""
@@ -38,6 +43,10 @@ class Snapshot:
     unix_offset_ns: int | None = None
     opened: Mapping[str, SourceOpened] = field(default_factory=lambda: MappingProxyType({}))
     """Open sources by their id."""
+    descriptions: Mapping[str, tuple[bytes, ...]] = field(
+        default_factory=lambda: MappingProxyType({})
+    )
+    """Chunks that new decoders of the open sources need before further chunks, by source."""
 
     def after_event(self, event: Event) -> Snapshot:
         """Return the state after an input event."""
@@ -72,9 +81,9 @@ class Snapshot:
         configured = replace(self.configured, calibration=output.calibration, calibration_age_s=0.0)
         return replace(self, configured=configured, calibrated_t_ns=t_ns)
 
-    def events(self, t_ns: int) -> list[UnchunkedEvent]:
+    def events(self, t_ns: int) -> list[UnchunkedEvent | ChunkArrived]:
         """Return the events that restore this state at `t_ns`."""
-        found: list[UnchunkedEvent] = []
+        found: list[UnchunkedEvent | ChunkArrived] = []
         if self.configured is not None:
             age_s = self.configured.calibration_age_s
             if self.configured.calibration is not None:
@@ -83,6 +92,11 @@ class Snapshot:
         if self.unix_offset_ns is not None:
             found.append(UnixOffset(t_ns, self.unix_offset_ns))
         found += [replace(event, t_ns=t_ns) for event in self.opened.values()]
+        found += [
+            ChunkArrived(source, Chunk(t_ns, data))
+            for source in self.opened
+            for data in self.descriptions.get(source, ())
+        ]
         return found
 
     def attachments(self) -> list[RecordedAttachment]:

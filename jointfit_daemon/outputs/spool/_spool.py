@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 BEFORE_S = 10.0
-"""Age of the messages that are stored when the connection is lost, s. A loss without a notification
-is detected within 8 s."""
+"""Largest age of the messages that are stored when the connection is lost, s. A loss without a
+notification is detected within 8 s."""
 START_S = 3.0
 """Time after the start during which a missing connection is not an outage, s."""
 WRITE_S = 0.5
@@ -107,7 +107,7 @@ class Spool:
         self._failure: str | None = None
 
     def add(self, topic: str, payload: bytes) -> None:
-        """Store a message in case of an outage; `topic` is relative to the base topic."""
+        """Store a message for delivery after an outage; `topic` is relative to the base topic."""
         now_s, message = time.monotonic(), SpooledMessage(topic, payload)
         if not self._link().connected:
             self._begin_outage(now_s)
@@ -119,7 +119,7 @@ class Spool:
             self._recent.popleft()
 
     def _begin(self) -> None:
-        """Process a new connection. Before the first connection, the outbox stores the messages."""
+        """Process a connection; at the first, discard messages that the outbox also contains."""
         if not self._began:
             self._began = True
             self._pending.clear()

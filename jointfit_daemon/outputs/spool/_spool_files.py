@@ -46,7 +46,7 @@ class SpoolFiles:
     folder
         Folder for the files, which is created with the first message.
     keep_bytes
-        Largest size of all files.
+        Largest total size of the files, bytes.
     """
 
     def __init__(self, folder: Path, keep_bytes: int) -> None:

@@ -138,7 +138,7 @@ class CalibrationSession:
 
     @property
     def phase(self) -> CalibrationPhase:
-        """The running phase; if none is running, whether a calibration is in use."""
+        """The running phase; if none is running, ``calibrated`` or ``uncalibrated``."""
         return self._resting_phase if self._state in RESTING else self._state
 
     @property
@@ -196,9 +196,10 @@ class CalibrationSession:
         return outputs
 
     def restart_sensor(self, t_ns: int, sensor: str) -> list[Output]:
-        """Discard the static pose, and abort the phase or fit that uses the sensor.
+        """Discard the static pose, and abort a phase or fit that the restart invalidates.
 
-        The restart may have changed the heading of the sensor.
+        The restart may have changed the heading of the sensor. A static phase and a functional fit
+        are not aborted.
         """
         recording, fit = self._recording, self._fit
         moving = recording is not None and recording.phase != CalibrationPhase.STATIC
@@ -321,7 +322,7 @@ class CalibrationSession:
         )
 
     def _functional_refusal(self) -> str | None:
-        """Return why the functional phase lacks markers or a static pose; None if it lacks none."""
+        """Return why the functional phase cannot start; None if markers and pose are complete."""
         named = {*self._settings.markers, *self._settings.rigid_bodies}
         bare = [segment for segment in self._chain.segments if segment not in named]
         if bare:
@@ -503,7 +504,7 @@ class CalibrationSession:
 
 
 def _seconds(value: object) -> float | None:
-    """Return a requested number of seconds; NaN if the value is not a number."""
+    """Return a requested number of seconds; None if absent, NaN if it is not a number."""
     if value is None:
         return None
     usable = isinstance(value, int | float) and not isinstance(value, bool)

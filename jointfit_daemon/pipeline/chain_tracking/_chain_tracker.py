@@ -41,8 +41,8 @@ FEWEST_MARKERS = 3
 """Smallest number of markers in a frame for a solution. Fewer markers do not determine the position
 of the first segment."""
 _FEW_EVALUATIONS = 8
-"""Largest number of evaluations of the marker errors for which the search of labels may run in the
-same frame."""
+"""Largest number of evaluations of the marker errors in a frame that leaves time for the search of
+labels in the same frame."""
 OPTIONS = LiveOptions(steps=6, huber_m=0.02, restart_interval=5)
 """Options of the solver. It takes up to six steps per frame, because frames are 100 ms apart. The
 Huber threshold limits the influence of an exchanged marker until it is excluded. A restart takes
@@ -101,7 +101,7 @@ class ChainTracker:
             self._monitor.search_labels(t_ns)
             return []
 
-        # Collect the markers of the model in a frame, m, shape (M, 3); NaN where missing.
+        # Collect the M markers of the model in a frame, m, shape (M, 3); NaN where missing.
         if frame.layout is not self._layout:
             self._layout = frame.layout
             column = {name: k for k, name in enumerate(frame.layout.markers)}

@@ -87,7 +87,7 @@ class MarkerMonitor:
 
     model: ChainModel
     excluded: NDArray[np.bool_] = field(init=False)
-    """Mask of the markers that inverse kinematics must not use, shape (M,)."""
+    """Mask of the markers that inverse kinematics must not use, shape (M,) for M markers."""
     misfit: bool = False
     """Whether the model as a whole does not fit."""
     _seen_ns: list[int | None] = field(init=False)
@@ -166,7 +166,7 @@ class MarkerMonitor:
         measured
             Marker positions in the world, m, shape (M, 3); NaN where hidden.
         rotations, origins
-            Poses of the segments in the world, shapes (S, 3, 3) and (S, 3), m.
+            Poses of the S segments in the world, shapes (S, 3, 3) and (S, 3), m.
 
         Returns
         -------
@@ -214,7 +214,7 @@ class MarkerMonitor:
     def _exclude(
         self, t_ns: int, suspects: Mapping[str, tuple[int, ...]], distances: Array
     ) -> list[MarkerReport]:
-        """Exclude markers whose suspicion lasts, unless the model as a whole does not fit."""
+        """Exclude markers that were suspect for `FAULT_NS`, unless the whole model does not fit."""
         lasting = self._lasting(t_ns, "far", suspects, FAULT_NS)
         if not lasting and not self.misfit:
             return []

@@ -64,7 +64,8 @@ class _TrainingFrame(NamedTuple):
     """Segment orientation q_optical_segment computed from each sensor, in the order of the
     chain."""
     mocap: list[Array]
-    """Markers, shape (k, 3), or rigid-body orientation, shape (4,), of each segment."""
+    """For each segment, its k markers, m, shape (k, 3), or its rigid-body orientation, shape
+    (4,)."""
 
 
 class OnlineFrameCollector:

@@ -1,7 +1,7 @@
 """State of online learning: whether it is possible, and reason and duration of an obstacle.
 
-An obstacle that lasts for `REPORT_NS` is reported once, and its end is reported once. If the
-subject is outside the view of the cameras, this is not an obstacle.
+An obstacle that lasts for `REPORT_NS` is reported once, and its end is reported once. The absence
+of the subject from the view of the cameras is not an obstacle.
 """
 
 from __future__ import annotations

@@ -32,11 +32,14 @@ class OnlineRefits:
     original: Calibration | None = None
     """Calibration before the first accepted refit. A reversion restores this calibration."""
     paused: bool = False
-    """Whether online learning is paused until the next functional calibration, after a
-    reversion."""
+    """Whether online learning is paused until the next functional calibration. A reversion or the
+    selection of a stored calibration pauses it."""
 
     def finish(self, event: JobFinished, before: Calibration, version: int | None) -> RefitOutcome:
-        """Return the outcome of the running refit."""
+        """Return the outcome of the running refit.
+
+        `before` is the current calibration, and `version` its number in the store.
+        """
         self.job = None
         result, kind = event.result, NoticeKind.CALIBRATION
         if result is None or event.failure is not None:

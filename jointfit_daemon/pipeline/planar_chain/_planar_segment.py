@@ -72,7 +72,7 @@ class PlanarSegment:
 
     @property
     def flat_template(self) -> NDArray[np.float64]:
-        """Template in real coordinates, m, shape (m, 2)."""
+        """Template in real coordinates, m, shape (m, 2) for m markers."""
         template = np.zeros(0) if self.template is None else self.template
         return np.column_stack((template.real, template.imag))
 
@@ -89,7 +89,7 @@ class PlanarSegment:
         t_ns
             Instant of the frame.
         z
-            Marker positions in the plane, m, shape (m,); NaN where missing.
+            Positions of the m markers in the plane, m, shape (m,); NaN where missing.
         """
         seen = np.isfinite(z)
         if self.template is None and seen.all():

@@ -65,13 +65,15 @@ class _Side:
     """Estimator of a joint center in the coordinates of one of the two body parts."""
 
     parent: str
+    """Body part in whose coordinates the center is estimated."""
     child: str
+    """The other body part."""
     circles: list[RunningCircle]
     """One circle fit for each marker of the other body part."""
     estimate: CenterEstimate | None = None
 
     def feed(self, pose: PlanarPose | None, child: NDArray[np.complex128]) -> None:
-        """Process one frame. `child` are the markers of the other part in the plane, m."""
+        """Process one frame; `child` contains the markers of the other part in the plane, m."""
         if pose is None:
             local = np.full(len(child), complex(np.nan, np.nan))
         else:
@@ -145,7 +147,7 @@ class PlanarTracker:
         if not (learned or shown):
             return []
 
-        # Collect the markers of every part, m, shape (m, 3); NaN where missing.
+        # Collect the k markers of every part, m, shape (k, 3); NaN where missing.
         if frame.layout is not self._layout:
             self._layout = frame.layout
             column = {name: k for k, name in enumerate(frame.layout.markers)}

@@ -369,8 +369,8 @@ def _orientations(
             absent = np.full((len(seen), 1, 3), np.nan)
             positions = np.concatenate((seen, absent), axis=1).take(columns, axis=1)
             parts.append(rigid_fit(cluster.template, positions)[0])
-        # The generator also yields for frames of `before`, so that the number of steps, on which
-        # results depend, is the same without `before`.
+        # The results depend on the number of steps. The generator therefore also yields for the
+        # frames of `before`, so that this number is the same without `before`.
         yield
     return t_ns, np.concatenate(parts)
 

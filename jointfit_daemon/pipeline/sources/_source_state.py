@@ -30,6 +30,8 @@ WITHHELD = ("unpublished", "duplicates", "late")
 """Counters that a decoder may have for frames that it decoded but did not return."""
 
 
+MOST_OPENING_BYTES = 65536
+"""Largest size of the kept chunks that arrived before the first measurement, bytes."""
 KEPT_SAMPLES = 1000
 """Number of samples and events after a reopening for which the time base of the previous decoder
 may be used."""
@@ -63,6 +65,9 @@ class SourceState:
     """Time base of the previous decoder, used until the current decoder has determined a time base,
     for at most `KEPT_SAMPLES` samples. A restart also ends its use, because the device may have
     been exchanged."""
+    _opening: list[bytes] = field(default_factory=list)
+    """Chunks that arrived after the opening and before the first measurement."""
+    _opening_bytes: int = 0
     _kept: int = 0
     """Number of further samples for which `_tick_clock` may be used."""
 
@@ -102,6 +107,7 @@ class SourceState:
 
         driver = self.source.driver_class(self.source.settings)
         self._decoder = driver.decoder()
+        self._opening, self._opening_bytes = [], 0
         self.open = True
         self.counts.opened += 1
 
@@ -176,7 +182,25 @@ class SourceState:
         if decoder is None:
             return []
         self.last_arrival_ns = chunk.t_ns
-        return self._process(decoder.feed(chunk), decoder)
+        if self.online:
+            return self._process(decoder.feed(chunk), decoder)
+
+        received = self.counts.received
+        items = self._process(decoder.feed(chunk), decoder)
+        self._opening_bytes += len(chunk.data)
+        if self.counts.received == received and self._opening_bytes <= MOST_OPENING_BYTES:
+            self._opening.append(chunk.data)
+        return items
+
+    def description(self) -> tuple[bytes, ...]:
+        """Return the chunks that a new decoder needs before further chunks; empty while closed.
+
+        See `jointfit_daemon.driver.Decoder`.
+        """
+        if self._decoder is None:
+            return ()
+        described: tuple[bytes, ...] | None = getattr(self._decoder, "description", None)
+        return tuple(self._opening) if described is None else described
 
     def _process(
         self, decoded: list[Decoded], decoder: Decoder
@@ -192,7 +216,7 @@ class SourceState:
         for item in decoded:
             if isinstance(item, _MEASUREMENTS):
                 stamped = self._stamp(item, tick_clock)
-                if clock.news:  # return events that a sample reveals before the sample
+                if clock.news:  # events that a sample reveals precede this sample
                     items += self._clock_events()
                 items.append(stamped)
                 continue

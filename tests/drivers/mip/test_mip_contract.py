@@ -63,6 +63,8 @@ class TestMipLegacyThatStreamsBothSetsFromTheStart(TestMip):
 class TestMipWithRawMeasurements(TestMip):
     """Raw measurements on the wire, orientation on the gateway."""
 
+    has_history = True
+
     @override
     def make_driver(self, folder: Path) -> Driver:
         return MipImu(settings(folder, orientation="gateway"))

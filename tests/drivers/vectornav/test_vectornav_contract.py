@@ -59,6 +59,8 @@ class TestVectorNavThatStreamsFromTheStart(TestVectorNav):
 class TestVectorNavWithRawMeasurements(TestVectorNav):
     """Raw measurements on the wire, orientation on the gateway."""
 
+    has_history = True
+
     @override
     def make_driver(self, folder: Path) -> Driver:
         return VectorNavImu(settings(folder, orientation="gateway", magnetometer=True))

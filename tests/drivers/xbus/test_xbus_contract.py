@@ -72,6 +72,8 @@ RAW_OUTPUTS = (
 class TestXbusThatOnlyFeels(TestXbus):
     """Raw readings on the wire, orientation on the gateway."""
 
+    has_history = True
+
     @override
     def make_device(self, folder: Path, wire_noise: WireNoise) -> XbusDevice:
         options = XbusDeviceOptions(outputs=RAW_OUTPUTS)

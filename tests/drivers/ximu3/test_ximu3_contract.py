@@ -75,6 +75,7 @@ class TestXImu3ThatIsListenedTo(TestXImu3):
 class TestXImu3WithOrientationOnTheGateway(TestXImu3):
     """Raw values have no norm and no smooth course: without a checksum, noise changes them."""
 
+    has_history = True
     has_noise = False
     device_settings: ClassVar[dict[str, object]] = {
         "ahrs_message_rate_divisor": 0, "inertial_message_rate_divisor": 4,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -85,3 +86,19 @@ def test_imu_placer_and_imu_inverse_kinematics_run_on_exported_sensors(
     knee = found.getDependentColumn("knee_angle_r").to_numpy()
     assert np.isfinite(knee).all()
     assert np.abs(knee).max() < 5.0
+
+
+def test_a_hidden_last_marker_does_not_end_the_row(tmp_path: Path) -> None:
+    session = walking_session()
+    assert session.markers is not None
+    positions = session.markers.positions.copy()
+    positions[3:6, -1] = np.nan
+    hidden = replace(session, markers=replace(session.markers, positions=positions))
+    path = write_session(hidden, tmp_path, "trc").files[0]
+    table = opensim.TimeSeriesTableVec3(str(path))
+    assert table.getNumRows() == len(positions)
+    last = table.getDependentColumnAtIndex(table.getNumColumns() - 1)
+    assert [k for k in range(len(positions)) if np.isnan(last[k].get(0))] == [
+        *np.flatnonzero(np.isnan(positions[:, -1, 0]))
+    ]
+    assert opensim.MarkersReference(str(path), opensim.SetMarkerWeights()).getNumFrames() > 0

@@ -139,7 +139,7 @@ async def test_broker_accepts_the_configured_client_certificate_only(
     ("files", "told"),
     [
         ({"ca": "nowhere.crt"}, "nowhere.crt: No such file"),
-        ({"ca": "daemon.key"}, "holds no certificate"),
+        ({"ca": "daemon.key"}, "contains no certificate"),
         ({"cert": "daemon.crt", "key": "broker.key"}, "expected a certificate and its own key"),
         ({"cert": "daemon.crt"}, "expected a certificate and its own key"),
         ({"cert": "daemon.crt", "key": "locked.key"}, "without a passphrase"),

@@ -80,6 +80,36 @@ def test_rotated_files_are_one_recording(tmp_path: Path) -> None:
     assert gap.reason == "a file of the session is missing"
 
 
+def test_every_file_begins_with_the_descriptions_of_the_sources(tmp_path: Path) -> None:
+    """Frames of cameras have no meaning without the list of marker names before them."""
+    described: dict[str, tuple[bytes, ...]] = {}
+    limits = RecordingLimits(file_bytes=10_000)
+    recorder = Recorder(tmp_path, "rig", limits, autostart=False, describe=lambda: dict(described))
+    for event in (SourceOpened(0, "S1"), SourceOpened(0, "mocap")):
+        recorder.event(event)
+    described["mocap"] = (b"server", b"first list")
+
+    recorder.begin()
+    write(recorder, chunks(1, 100))
+    described["mocap"] = (b"server", b"second list")
+    write(recorder, chunks(100, 200))
+    write(recorder, chunks(200, 300))
+    recorder.close()
+    files = sorted(tmp_path.iterdir())
+    assert len(files) >= 3
+
+    def beginning(path: Path) -> list[tuple[str, bytes]]:
+        found = [
+            event for event in open_recording(path).events() if isinstance(event, ChunkArrived)
+        ]
+        return [(event.source, event.chunk.data) for event in found[:2]]
+
+    assert beginning(files[0]) == [("mocap", b"server"), ("mocap", b"first list")]
+    for path in files[:2]:
+        path.unlink()
+    assert beginning(files[2]) == [("mocap", b"server"), ("mocap", b"second list")]
+
+
 def test_the_names_of_a_new_file_and_folder_are_on_the_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
