@@ -234,7 +234,7 @@ class HoldoutQuality:
     """Procedure of the calibration: ``corrected`` or ``patent``."""
     meaning: str = (
         "RMS distance from the optical reference on the last part of the trial, after a fit to the"
-        " first part; the stored models were then fitted to all of it"
+        " first part; the stored models were then fitted to the whole trial"
     )
     """Explanation for readers of the published table."""
 
@@ -256,8 +256,8 @@ class RegressionQuality:
     errors.
     """
     stored: tuple[tuple[float, ...], ...]
-    """Coefficients that the fusion uses. They were fitted to the whole trial, in the procedure
-    ``patent`` to its first part.
+    """Coefficients that the fusion uses. They were fitted to the whole trial or, in the procedure
+    ``patent``, to its first part.
     """
 
 

@@ -45,7 +45,7 @@ class OpticalTrack:
     """Measurements of the optical system over time, with NaN for occluded markers and bodies."""
 
     t_ns: NDArray[np.int64]
-    """Instants of exposure, shape (m,), strictly increasing."""
+    """Instants of exposure of the m frames, ns, shape (m,), strictly increasing."""
     markers: tuple[str, ...]
     positions: NDArray[np.float64]
     """Marker positions in the optical world (z up), m, shape (m, len(markers), 3)."""
@@ -135,11 +135,11 @@ class OnlineFrames:
     """New complete frames of sensors and markers, in order of time."""
 
     sensors: Mapping[str, Array]
-    """q_optical_segment of each sensor, which includes the sensor-to-segment alignment, shape (n,
-    4).
+    """q_optical_segment of each sensor, which includes the sensor-to-segment alignment, shape
+    (n, 4) for n frames.
     """
     markers: Mapping[str, Array]
-    """Marker positions of the cluster of each segment in the optical world, m, shape (n, k, 3).
+    """Positions of the k markers of each segment's cluster, optical world, m, shape (n, k, 3).
 
     A segment with a rigid body is in `bodies` instead."""
     bodies: Mapping[str, Array]

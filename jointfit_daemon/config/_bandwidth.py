@@ -36,7 +36,7 @@ def frame_bits(data_bytes: int, *, extended: bool) -> int:
 
     A frame has s bits from its start to the end of its checksum, without data: s = 34 with an
     11-bit identifier, s = 54 with a 29-bit identifier. With d data bytes, at most (s + 8 d − 1) / 4
-    stuff bits occur (ISO 11898-1).
+    stuff bits occur, rounded down (ISO 11898-1).
     """
     plain, stuffed = (64, 54) if extended else (44, 34)
     gap = 3
@@ -72,11 +72,11 @@ def _adapter_line(bus: CanBusSettings) -> tuple[str, int, Callable[[int, bool], 
 
 
 def least_load(settings: Any, unknown: Iterable[str]) -> Any:
-    """Return a sensor's settings with the smallest possible load; None if unknown.
+    """Return a sensor's settings with the smallest possible load; None if no load is known.
 
     A faulty value, such as a misspelled value of the key `orientation`, may stand for any valid
-    value. Its load is at least the smallest load of all valid values. If even this load is too
-    large, the line is too slow in any case.
+    value. The result therefore contains the valid value with the smallest load. If even this load
+    is too large, the line is too slow in any case.
 
     Parameters
     ----------
@@ -110,10 +110,10 @@ def least_load(settings: Any, unknown: Iterable[str]) -> Any:
 
 
 def _choices(field: FieldInfo) -> list[Any]:
-    """Return all values of a Boolean or a choice, the default of an inner table, or an empty list.
+    """Return all values of a Boolean or a choice, or the default of an inner table.
 
-    The default represents all values of an inner table, such as CAN identifiers, because they do
-    not change the load.
+    The list is empty for other fields. The default represents all values of an inner table, such as
+    CAN identifiers, because they do not change the load.
     """
     annotation: Any = field.annotation
     if annotation is bool:

@@ -28,12 +28,15 @@ class BranchedLimb(NamedTuple):
     joints: tuple[str, ...]
     segments: tuple[str, ...]
     parents: tuple[int | None, ...]
+    """Index of the segment proximal of each joint; None for the origin."""
     left: tuple[bool, ...]
+    """Whether each joint is on the left side."""
     distals: tuple[str | None, ...]
+    """Body part distal of the last joint of each branch; None if there is none."""
 
 
 def branched_limb(table: ChainTable) -> BranchedLimb:
-    """Return the limb of a table without faults.
+    """Return the limb that `table` describes; `table` must have no faults.
 
     The position of the first segment is published under the name ``NAME_origin``. It is the
     midpoint of the segment's two distal joints.
@@ -89,8 +92,8 @@ def check_branches(table: ChainTable) -> list[Fault]:
     """Check that the joints connect all segments to one tree.
 
     In `table`, a key whose value could not be read is None. Each check requires that the checks
-    before it found no fault. The result contains the faults of keys for limbs without branches,
-    and the faults of the first check that found any.
+    before it found no fault. The result contains the faults of keys that only limbs without
+    branches have, and the faults of the first check that found any.
     """
     given = {"joints": table.joints, "proximal": table.proximal, "distal": table.distal}
     given["side"] = "left" if table.side == "left" else None
@@ -175,7 +178,7 @@ def _check_shape(table: ChainTable) -> Iterator[Fault]:
             yield Fault(_KEY, f"{found}, {text}")
         elif segment != root and not names:
             text = f"add its distal end with parent = {segment!r}, such as the ankle of a shank"
-            yield Fault(_KEY, f"{found}, expected one: {text}; it may have no child")
+            yield Fault(_KEY, f"{found}, expected one: {text}; this joint needs no child")
         elif segment != root and len(names) > 1:
             text = f"expected one: only the first segment ({root!r}) has branches"
             yield Fault(_KEY, f"{found}, {text}")

@@ -27,9 +27,9 @@ it in further checks."""
 def unusable_keys(table: Mapping[str, Any], in_use: Iterable[str]) -> dict[str, str]:
     """Return the faults of a bus by key; empty if at least one CAN driver accepts the bus.
 
-    Only drivers know which interfaces can be opened. The drivers `in_use` check the bus first. If
-    one of them accepts it, no other driver is imported. All other drivers check a bus that no
-    sensor uses.
+    Only drivers know which interfaces can be opened. The drivers `in_use` check the bus first,
+    then all others until one accepts the bus. A driver after that one is not imported. If no
+    driver accepts the bus, the faults of the first driver are returned.
     """
     bus = readable_part({"channel": "can0", **table}, CanBusSettings, [])
     defaults = dict(CanBusSettings(channel="can0"))

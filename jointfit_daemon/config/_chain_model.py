@@ -68,9 +68,10 @@ def content_of(model: LoadedModel) -> dict[str, Any]:
 def load_chain_model(
     given: str | dict[str, Any], table: ChainTable, mocap: MocapSettings | None
 ) -> tuple[LoadedModel | None, list[Fault]]:
-    """Return the chain model and its faults; keys of the tables that had faults are None.
+    """Return the chain model of the key `given`, and its faults.
 
-    The remarks of the returned model list the rig's markers that the model does not contain.
+    In `table` and `mocap`, keys that had faults are None. The remarks of the returned model list
+    the rig's markers that the model does not contain.
     """
     try:
         loaded = read_chain_model(given)
@@ -184,7 +185,7 @@ def _find_carriers(
         counted = Counter(of[name] for name in names if name in of)
         if not counted:
             text = f"none of these markers is in chain.model, which has {list_names(list(of))}"
-            faults.append(Fault(key, f"{text}: rename them in one of the two", list(names)))
+            faults.append(Fault(key, f"{text}: rename them here or in the model", list(names)))
             continue
 
         carrier = carriers[part] = counted.most_common(1)[0][0]

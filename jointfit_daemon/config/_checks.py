@@ -1,6 +1,7 @@
 """Checks of names, and of values in several tables of rig.toml.
 
-Invariant: every check returns all its faults.
+Invariant: a check returns all faults of its tables, except the faults that another fault causes. A
+check of one name returns at most one fault.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ def check_topic_name(key: str, name: str) -> list[Fault]:
 
 
 def check_topic_base(key: str, base: str) -> list[Fault]:
-    """Check the base topic: it may contain slashes, but no empty level."""
+    """Check the base topic, which may contain slashes, but no empty level."""
     return [
         Fault(key, fault.expected, base)
         for level in base.split("/")
@@ -105,9 +106,9 @@ def check_folder_name(key: str, name: str) -> list[Fault]:
 
 
 def check_chain(table: ChainTable) -> Iterator[Fault]:
-    """Check the names of the limb, its lengths, and the number of joints.
+    """Check the names of the limb, its branches, lengths and angle conventions.
 
-    Keys of `table` that had faults are None.
+    The number of joints is checked as well. Keys of `table` that had faults are None.
     """
     names_of = {"joints": table.joints, "segments": table.segments}
     if table.joint != ():
@@ -189,7 +190,10 @@ def check_procedure(
 def check_known_name(
     key: str, name: str, known: Collection[str], what: str, taken: Collection[str] = ()
 ) -> list[Fault]:
-    """Check that `name` is one of `known`. A suggested name is never one of `taken`."""
+    """Check that `name` is one of `known`; `what` is the kind of these names, such as "segment".
+
+    The fault suggests the most similar name that is not one of `taken`.
+    """
     if name in known:
         return []
     choices = ", ".join(known) or "none"
@@ -220,7 +224,7 @@ def check_sensors(imus: Sequence[Mapping[str, Any]], table: ChainTable | None) -
             key = f"imu[{imu_name(imu, at)}].segment"
             yield from check_known_name(key, imu["segment"], table.segments, "segment")
     if any(not isinstance(imu.get("segment"), str) for imu in imus):
-        return  # the sensor with this fault, which is reported already, may be on any segment
+        return  # this fault is reported already, and the sensor may be on any segment
     for segment in table.segments:
         if segment not in worn and table.motion != "planar":
             yield Fault("imu", f"segment {segment!r} has no sensor, expected at least one")
@@ -255,7 +259,10 @@ def check_markers(settings: MocapSettings, table: ChainTable | None) -> Iterator
         if not planar and len(set(names)) < _LEAST_MARKERS:
             yield Fault(key, "expected at least three different markers", list(names))
         if part in given["rigid_body"]:
-            yield Fault(f"mocap.rigid_body.{part}", "has markers already; give one of the two")
+            yield Fault(
+                f"mocap.rigid_body.{part}",
+                "has markers already: remove the markers, or this rigid body",
+            )
 
     # A marker belongs to one body part.
     owners: dict[str, str] = {}
@@ -266,7 +273,7 @@ def check_markers(settings: MocapSettings, table: ChainTable | None) -> Iterator
 
 
 def check_planar(table: ChainTable, cameras: MocapSettings | None, imus: object) -> Iterator[Fault]:
-    """Check that a planar rig has no sensors, and markers for every joint.
+    """Check that a planar rig has no sensors, and enough markers on every segment and end.
 
     Keys that had faults are None.
     """
@@ -276,7 +283,7 @@ def check_planar(table: ChainTable, cameras: MocapSettings | None, imus: object)
         yield Fault("chain.motion", "planar motion needs cameras: add [mocap]", "planar")
         return
     if imus:
-        text = "expected none with chain.motion = planar, which cameras alone follow: remove one"
+        text = "expected none with chain.motion = planar, which needs cameras only: remove one key"
         yield Fault("imu", text)
     if table.joint:
         yield Fault("chain.joint", "planar motion has no branches: use joints, or remove motion")
@@ -413,7 +420,7 @@ def missing_files(mqtt: MqttSettings) -> list[str]:
 
 
 def drifting_imus(sources: Sequence[Source]) -> frozenset[str]:
-    """Return the IMUs whose heading drifts: the gateway computes it without a magnetometer."""
+    """Return the IMUs whose heading drifts, because the gateway uses no magnetometer for it."""
     return frozenset(_on_gateway(sources)[True])
 
 
@@ -437,13 +444,13 @@ def heading_warning(sources: Sequence[Source]) -> str | None:
         return None
     return (
         f"heading by magnetometer on {', '.join(drifts[False])}, but not on "
-        f"{', '.join(drifts[True])}: their heading drifts, and joint rotation with it; "
+        f"{', '.join(drifts[True])}: the heading of the latter drifts, and joint rotation with it; "
         "set the same `magnetometer` for all"
     )
 
 
 def binding_warning(sources: Sequence[Source]) -> str | None:
-    """Return a warning if no segment has markers for the cameras to measure; None otherwise.
+    """Return a warning if a rig with cameras has no markers on any segment; None otherwise.
 
     The configuration is permitted, because a single plate with markers measures the axes of the
     sensors.

@@ -61,7 +61,8 @@ SECTIONS = (
 def load_rig(path: Path) -> Rig:
     """Read and check the rig.toml at `path`.
 
-    File names in ``[mqtt]``, ``[chain]`` and ``[[imu]]`` are relative to the folder of `path`.
+    File names in ``[mqtt]``, ``[chain]``, ``[[imu]]`` and ``[calibration.chain_refinement]`` are
+    relative to the folder of `path`.
 
     Raises
     ------
@@ -133,7 +134,7 @@ class _RigReader:
         self.imus_read: list[Source] = []
         """All IMUs whose tables are readable, even if the tables have faults."""
         self.imus_with_load: list[Source] = []
-        """IMUs of `imus_read` whose load is known. Wrong choices count with the smallest load."""
+        """IMUs of `imus_read` with known load. A faulty key counts with its smallest load."""
         for key in table:
             if key not in SECTIONS:
                 known = f"unknown table; known: {', '.join(SECTIONS)}"
@@ -205,7 +206,7 @@ class _RigReader:
         calibration: CalibrationTable | None,
         cameras: MocapSettings | None,
     ) -> None:
-        """Check the limb and its calibration; tables with faults are partial models."""
+        """Check the limb and its calibration; partial models replace the tables with faults."""
         limb = chain or self.partial.get("chain")
         if limb is not None:
             self.faults += _checks.check_chain(limb)
@@ -239,7 +240,10 @@ class _RigReader:
     def _chain_refinement(
         self, calibration: CalibrationTable | None, model: LoadedModel | None
     ) -> ChainRefinement | None:
-        """Return the refinement of the chain model; weights replace the name of their file."""
+        """Return the refinement of the chain model; None without a model or if a key is faulty.
+
+        If the table contains the name of a weight file, the content of the file replaces the name.
+        """
         table = calibration or self.partial.get("calibration")
         key, name = "calibration.chain_refinement", "chain_refinement"
         section = self.table.get("calibration")
@@ -457,7 +461,7 @@ def _likely_driver(
 ) -> type[Driver] | None:
     """Return the driver that the table probably means, so that its other keys can be checked.
 
-    The first choice is the driver whose name is similar to the misspelled name (`near`). The second
+    The first choice is the driver `near`, whose name is similar to the misspelled name. The second
     choice is the driver that accepts the largest number of keys that are not common to all drivers.
     """
     drivers = _drivers(base)

@@ -26,7 +26,7 @@ def readable_part(table: Mapping[str, Any], model: type[Model], wrong: _Location
     Parameters
     ----------
     table
-        The table; keys that its model refuses are omitted.
+        The table. Keys that `model` refuses are omitted from the result.
     model
         Model of the table.
     wrong
@@ -36,8 +36,8 @@ def readable_part(table: Mapping[str, Any], model: type[Model], wrong: _Location
     -------
     Model
         Model whose unreadable keys are None: missing required keys, keys that are probably
-        misspelled, and keys with unreadable values. In arrays of texts, a number becomes the text
-        of its digits.
+        misspelled, and keys with unreadable values. In a faulty array of texts, every value is
+        converted to a text.
     """
     fields = model.model_fields
     unknown = table.keys() - fields.keys()
@@ -57,7 +57,7 @@ def readable_part(table: Mapping[str, Any], model: type[Model], wrong: _Location
 
 
 def _readable(value: Any, annotation: Any, wrong: _Locations) -> Any:
-    """Return the readable part of `value`; None if there is none."""
+    """Return the readable part of `value`; None if no part is readable."""
     if isinstance(value, dict) and get_origin(annotation) is tuple:
         value = [value]  # some drivers accept one table instead of an array
     if not wrong:
@@ -86,7 +86,7 @@ def _valid(value: Any, annotation: Any) -> Any:
     try:
         return _adapter(annotation).validate_json(json.dumps(value, default=str), strict=True)
     except ValidationError:
-        return None  # the driver's validator raised because of another key
+        return None  # without a reported fault, because a validator raised for another key first
 
 
 @cache
@@ -102,7 +102,7 @@ def _below(wrong: _Locations) -> dict[int | str, _Locations]:
 
 
 def _elements(values: Sequence[Any], kind: Any, wrong: _Locations) -> tuple[Any, ...] | None:
-    """Return the readable elements of an array; None for texts that contain tables or arrays."""
+    """Return the readable elements of an array; None if a text array contains tables or arrays."""
     if kind is not str:
         parts = _below(wrong)
         return tuple(_readable(value, kind, parts.get(at, [])) for at, value in enumerate(values))
@@ -112,7 +112,7 @@ def _elements(values: Sequence[Any], kind: Any, wrong: _Locations) -> tuple[Any,
 
 
 def contradictions(settings: BaseModel, key: str) -> Iterator[Fault]:
-    """Return the contradictions between values of `settings`, or of one of its inner tables.
+    """Yield the contradictions between values of `settings`, and those of its inner tables.
 
     Parameters
     ----------

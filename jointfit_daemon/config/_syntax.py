@@ -34,7 +34,7 @@ _MOST_LINES = 200
 """Largest number of lines of one value in a file with syntax errors."""
 UNREADABLE = "unreadable-line"
 """Key of the table that replaces the value on a line with a syntax error. No table of a rig has
-this key, so the value is wrong everywhere. Its further faults are not reported."""
+this key, so the value is wrong everywhere. Further faults of this value are not reported."""
 _POSITION = re.compile(r"(.*?)(?: \(at (?:line (\d+), column \d+|end of document)\))?", re.DOTALL)
 _HEADER = re.compile(r"\[{1,2}\s*([\w-]+(?:\s*\.\s*[\w-]+)*)")
 _WHOLE_HEADER = re.compile(rf"{_HEADER.pattern}\s*\]{{1,2}}\s*(?:#.*)?")
@@ -128,8 +128,8 @@ class _Repair:
         self._starts: list[int] = []
         """Line indices at which the statements start."""
         self._repeated: dict[str, list[str]] = {}
-        """Repeated tables by their temporary name, with the path of the first table of the same
-        name."""
+        """Path of the first table of the same name, by the temporary name of each repeated
+        table."""
 
     def replace_statements(self) -> None:
         """Replace every statement that is invalid TOML when parsed alone."""
@@ -140,7 +140,7 @@ class _Repair:
             at += length or self._replace(at)
 
     def parse(self) -> dict[str, Any] | None:
-        """Remove repeated keys and tables; return the table, or None if it is invalid."""
+        """Remove repeated keys and tables; return the table, or None if the text stays invalid."""
         for _ in range(_MOST_REPEATED):
             error = _error_of(text := "\n".join(self.lines))
             if error is None:
@@ -155,7 +155,7 @@ class _Repair:
         self.faults.append(Fault(where, text, *shown))
 
     def _length(self, at: int) -> int:
-        """Return the number of lines of the statement at `at`; 0 if it is not TOML."""
+        """Return the number of lines of the statement at line index `at`; 0 if it is not TOML."""
         line = self.lines[at]
         opened = any(mark in line for mark in ('"""', "'''")) or any(
             line.count(opening) > line.count(closing) for opening, closing in ("[]", "{}")
@@ -244,7 +244,7 @@ def _replacement(line: str, at: int) -> str:
 
 
 def without_unreadable(fault: Fault) -> Fault | None:
-    """Return the fault of a value; None if its line is already reported as a syntax error.
+    """Return `fault`; None if its line is already reported as a syntax error.
 
     An unknown key on such a line is a separate fault, which is returned without its value.
     """

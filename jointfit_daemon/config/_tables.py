@@ -57,7 +57,7 @@ class JointTable(Settings):
         "only (foot), or none",
     )
     side: Literal["right", "left"] | None = Field(
-        None, description="side of the body; default: that of the joint above it"
+        None, description="side of the body; default: the side of the joint above it"
     )
 
 
@@ -142,7 +142,7 @@ class ChainRefinementTable(Settings):
         0.0,
         ge=0,
         le=0.5,
-        description="share at the end of the training part that decides when to stop",
+        description="share of the training part, at its end, that decides when the iteration stops",
     )
     frames: int = Field(
         150, ge=10, le=1000, description="largest number of frames of each part, evenly spaced"
@@ -216,7 +216,7 @@ class CalibrationTable(Settings):
     center_method: CenterMethod = Field(
         "sphere",
         description="estimator of the joint centers; all but `sphere` and `score` need a movement "
-        "about one axis, and refuse others",
+        "about one axis, and refuse other movements",
     )
     joint_center_methods: dict[str, CenterMethod] = Field(
         default_factory=dict,
@@ -286,7 +286,7 @@ class HomeAssistantSettings(Settings):
 
 
 class SpoolSettings(Settings):
-    """``[mqtt.spool]``: if present, events and poses of a broker outage are published after it."""
+    """``[mqtt.spool]``: if present, events and poses of a broker outage are published later."""
 
     pose_hz: float = Field(
         1.0, ge=0, le=10, description="poses stored per second of an outage, Hz; 0: none"
@@ -365,7 +365,7 @@ class MqttSettings(Settings):
         None, description="discovery by Home Assistant; default: none"
     )
     spool: SpoolSettings | None = Field(
-        None, description="messages of a broker outage are published after it; default: not"
+        None, description="later publication of the messages of a broker outage; default: none"
     )
 
     @field_validator("host")

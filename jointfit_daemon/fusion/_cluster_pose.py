@@ -77,7 +77,7 @@ class ClusterPose:
         """Quantities of the set of all markers, which is the usual case."""
 
     def fit(self, frame: MocapFrame) -> FittedPose | None:
-        """Return the pose in `frame`, or None if too few markers are visible."""
+        """Return the pose in `frame`; None if too few markers are visible or they do not fit."""
         columns = self._columns
         if columns is None:
             return None
@@ -96,8 +96,9 @@ class ClusterPose:
     def _fit_markers(self, seen: list[Vector]) -> FittedPose | None:
         r"""Return the pose from the visible markers, with the rotation of Horn (1987).
 
-        If :math:`\lambda` is the largest sum of ``y · R a``, the sum of squared residuals is
-        :math:`\sum |a|^2 + \sum |y|^2 - 2 \lambda`.
+        a and y are the positions of a marker in the template and in the frame, relative to their
+        means. If :math:`\lambda` is the largest sum of ``y · R a``, the sum of squared residuals
+        is :math:`\sum |a|^2 + \sum |y|^2 - 2 \lambda`.
         """
         subset = self._all
         if not all(isfinite(x + y + z) for x, y, z in seen):

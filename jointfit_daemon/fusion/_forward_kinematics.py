@@ -87,6 +87,17 @@ def joint_positions(
     e_x`; their variance contains half the length and half the standard deviation of the length. The
     propagation is of first order, with isotropic orientation errors. Both values are None for all
     joints distal to a segment of unknown orientation or length.
+
+    Parameters
+    ----------
+    origin : Vector
+        Position of O1, m.
+    fused : sequence of FusedSegment
+        Orientation of each segment.
+    lengths : sequence of SegmentLength
+        Length of each segment.
+    places : sequence of JointPlace
+        Result of `joint_places`, for all joints except O1.
     """
     traces = [0.0]
     out: list[tuple[Vector | None, float | None]] = [(origin, 0.0)]

@@ -1,4 +1,4 @@
-r"""Rotation between two sets of matched points, computed without matrix operations.
+r"""Rotation between two sets of matched points a_k and y_k, computed without matrix operations.
 
 The rotation is the unit quaternion q that maximizes :math:`q^T N q` (Horn 1987, J. Opt. Soc. Am. A
 4:629), an eigenvector of the largest eigenvalue of the symmetric matrix N. With the cross moment

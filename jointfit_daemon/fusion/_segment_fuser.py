@@ -185,7 +185,10 @@ class SegmentFuser:
         return FusedSegment(q, sd, alive, flags, flexion_sd)
 
     def _with_heading_sd(self, t_ns: int, sd: float) -> float:
-        """Add the variance of the heading, for one axis of three; it grows with time."""
+        """Return `sd`, increased by the heading error, which grows with time.
+
+        The heading is about one of three axes, so a third of its variance is added per axis.
+        """
         if self._calibrated_ns is None:
             self._calibrated_ns = t_ns
         minutes = (t_ns - self._calibrated_ns) / MINUTE_NS

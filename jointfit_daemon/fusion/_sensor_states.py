@@ -29,8 +29,9 @@ def sensor_states(
     .. math:: q_{so} = q_W \otimes q_s \otimes q_\mathrm{bias}, \qquad
               q_j = q_\mathrm{proximal}^* \otimes q_\mathrm{distal}
 
-    where q_W is the rotation of the sensor's world and q_bias the sensor-to-segment alignment. The
-    source is the patent, steps S3 and S7.
+    where q_so is the orientation of the segment from one sensor, q_s the orientation of this
+    sensor, q_W the rotation of its world, q_bias the sensor-to-segment alignment, and q_j the
+    rotation of a joint. The source is the patent, steps S3 and S7.
 
     Parameters
     ----------

@@ -155,8 +155,7 @@ class Core:
 
     def descriptions(self) -> dict[str, tuple[bytes, ...]]:
         """Return the chunks that new decoders of the open sources need before further chunks."""
-        found = {name: state.description() for name, state in self._sources.items() if state.open}
-        return {name: chunks for name, chunks in found.items() if chunks}
+        return {name: state.description() for name, state in self._sources.items()}
 
     def health(self, now_ns: int) -> CoreHealth:
         """Return the core's part of ``bridge/health``."""
@@ -257,15 +256,14 @@ class Core:
         self._lag_ns |= self._lags.known_lags_ns()
         self._comparison = OpticalComparison(rig.chain, usable, rig.mqtt.optical_hz)
         self._usable = usable
-        rate_hz = rig.mqtt.sensors_hz
-        self._sensors_rate = RateDivider(rate_hz) if rate_hz > 0.0 else None
+        self._sensors_rate = RateDivider(rig.mqtt.sensors_hz) if rig.mqtt.sensors_hz > 0.0 else None
         centers = MovingCenters(rig.chain, usable, rig.mqtt.centers_memory_s)
         if self._moving_centers is None or not self._moving_centers.serves(centers):
             self._moving_centers = centers
         self._chain_tracker = chain_tracker(rig, usable, self._chain_tracker)
         self._label_monitor = label_monitor(rig, usable, self._label_monitor)
-        wanted = rig.calibration.learn_online
-        self._collector = OnlineFrameCollector(rig.chain, usable, wanted=wanted)
+        learns = rig.calibration.learn_online
+        self._collector = OnlineFrameCollector(rig.chain, usable, wanted=learns)
 
     # --- sources -----------------------------------------------------------------------------
 
@@ -317,8 +315,7 @@ class Core:
         # After the process was delayed, samples of other sources may still be in the kernel.
         # Deadlines are therefore applied only at other events, such as a Tick, which follows after
         # all available data were read.
-        outputs += self._advance(complete_only=True)
-        return outputs
+        return outputs + self._advance(complete_only=True)
 
     def _process(
         self,

@@ -66,7 +66,7 @@ _COMMAND_BYTES = 4096
 _PERFECT = "all imperfections zero, except clock offsets, minimum latencies, and those in --set"
 """Help text of ``--perfect``."""
 COMMANDS = """commands, one per line on standard input:
-  play NAME                   change to another motion
+  play NAME, play NAME at-once  change to another motion, with or without a blend
   unplug ID, plug ID          disconnect or connect a sensor, or the bus adapter (can0)
   reboot ID                   restart a sensor or mocap, and its clock
   stick ID, free ID           start or stop repeating the last sample of a sensor
@@ -326,7 +326,8 @@ async def _run_scene(scene: Scene, followed: RigOptions | None, limb: str) -> No
         asyncio.get_running_loop().add_signal_handler(number, scene.stop)
 
     def play(name: str) -> None:
-        scene.command(f"play {name}")
+        # Sensors are already on the plate when a person starts the phase.
+        scene.command(f"play {name} at-once" if name == "plate" else f"play {name}")
         _print_json({"motion": name})
 
     def report(text: str) -> None:

@@ -70,6 +70,10 @@ class DecodingReceiver:
         self.decoder = driver.decoder()
         self._measurement = measurement
 
+    def restarted(self, driver: Driver) -> DecodingReceiver:
+        """Return a receiver with a new decoder and no chunks."""
+        return DecodingReceiver(driver, self._measurement)
+
     def emit(self, chunk: Chunk) -> None:
         """Store and decode one chunk."""
         self.chunks.append(chunk)

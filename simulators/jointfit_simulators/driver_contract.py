@@ -58,6 +58,7 @@ from jointfit_simulators._contract_fixtures import (
     require_error,
     serve_device,
 )
+from jointfit_simulators._late_start_contract import LateStartContract
 from jointfit_simulators.imu_device import clean_wire
 
 if TYPE_CHECKING:
@@ -67,8 +68,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.driver import Driver
     from jointfit_simulators.imu_device import WireNoise
 
-_LATER = 5
-"""Number of samples for a decoder that starts later."""
 _BITS = 10
 """Number of bits per byte on a serial line (8N1)."""
 _INCOMPLETE = 3
@@ -81,7 +80,7 @@ _SILENCE_NS = 60 * NS_PER_S
 """Time without bytes after which an incomplete message is lost at any line speed, ns."""
 
 
-class DriverContract(ABC):
+class DriverContract(LateStartContract, ABC):
     """Tests that every driver must pass."""
 
     registered_as: ClassVar[str | None] = None
@@ -101,8 +100,6 @@ class DriverContract(ABC):
     the tests end sooner."""
     baud: ClassVar[int | None] = 115_200
     """Line speed in the driver's settings, bit/s; None if transmission takes no time (USB, TCP)."""
-    has_history: ClassVar[bool] = False
-    """Whether samples depend on many earlier samples, as those of an orientation filter."""
     has_noise: ClassVar[bool] = True
     has_plug: ClassVar[bool] = True
 
@@ -239,38 +236,6 @@ class DriverContract(ABC):
             require(
                 repr(again.events) == repr(receiver.events), "a replay must give the same events"
             )
-
-        asyncio.run(scene())
-
-    def test_a_decoder_that_starts_later_needs_only_the_description(self, tmp_path: Path) -> None:
-        """A recording that starts while the device streams begins with the description."""
-        if self.has_history:
-            raise SkipTest("the orientation filter begins again")
-
-        async def scene() -> None:
-            device, driver = self.make_device(tmp_path, clean_wire), self.make_driver(tmp_path)
-            async with self.streaming(device, driver) as (receiver, first):
-                numbers = (await self._send_all(device, receiver, first, 20))[-_LATER:]
-
-            # The later decoder receives the chunks with the last samples.
-            again, opening, begin = DecodingReceiver(driver, self.measurement), [], 0
-            for place, chunk in enumerate(receiver.chunks):
-                if len(receiver.measurements) - len(again.measurements) > _LATER:
-                    begin = place
-                again.emit(chunk)
-                if not again.measurements:
-                    opening.append(chunk.data)
-
-            described = getattr(receiver.decoder, "description", None)
-            later = DecodingReceiver(driver, self.measurement)
-            for data in opening if described is None else described:
-                later.emit(Chunk(receiver.chunks[begin].t_ns, data))
-            for chunk in receiver.chunks[begin:]:
-                later.emit(chunk)
-            found = later.measurements[-len(numbers) :]
-            require(len(found) == len(numbers), "the later decoder must return all samples")
-            for number, item in zip(numbers, found, strict=True):
-                require(self.matches(number, item), expected_text(item, number))
 
         asyncio.run(scene())
 

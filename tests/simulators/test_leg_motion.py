@@ -181,6 +181,15 @@ def test_switch_changes_later_coordinates_only() -> None:
     assert [script.name_at(t) for t in (2.9, 3.1, 6.0)] == ["stand", "squat", "squat"]
 
 
+def test_a_motion_that_begins_at_once_has_no_blend() -> None:
+    script = MotionScript(MOTIONS_OF_STYLE, parse_motion_script("stand:5,walk"))
+    script.play("squat", 3.0, at_once=True)
+    t = np.arange(3.001, 9, 0.1)
+    np.testing.assert_allclose(script.coordinates(t), MOTIONS_OF_STYLE["squat"](t - 3.0))
+    script.discard_before(3.5)
+    np.testing.assert_allclose(script.coordinates(t[6:]), MOTIONS_OF_STYLE["squat"](t[6:] - 3.0))
+
+
 def test_discarding_past_motions_does_not_change_later_coordinates() -> None:
     steps = parse_motion_script("stand:3,walk:1,squat:3,turn")
     whole, discarding = MotionScript(MOTIONS_OF_STYLE, steps), MotionScript(MOTIONS_OF_STYLE, steps)

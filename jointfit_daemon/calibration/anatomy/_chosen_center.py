@@ -45,7 +45,7 @@ class CenterChoice:
     methods: Mapping[str, CenterMethod] = field(default_factory=dict)
     """Estimator by joint; joints that are absent use ``sphere``."""
     turned: Mapping[str, Array] = field(default_factory=dict)
-    """Rotation q_now_static of each segment from its IMUs, at the instants of the tracks, shape
+    """Rotation q_now_static of each segment from its IMUs, at the m instants of the tracks, shape
     (m, 4); NaN where unknown."""
 
 
@@ -124,8 +124,9 @@ def chosen_center(
 def _angle_leverage(angles: Array, unseen: Array) -> Array:
     r"""Return the covariance of a center per m² of artefact variance for known angles, (3, 3).
 
-    In the plane, positions are linear in center and marker, :math:`x_t = c + R(\theta_t) p`. The
-    covariance for one observation of unit variance is
+    In the plane, the position of a marker in frame t is linear in the center c and in the marker p
+    on the segment, :math:`x_t = c + R(\theta_t) p`. The covariance for one observation of unit
+    variance is
 
     .. math:: L = I / (1 - |\bar z|^2), \qquad \bar z = \mathrm{mean}_t\, e^{i \theta_t}.
     """

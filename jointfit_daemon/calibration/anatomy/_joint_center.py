@@ -59,9 +59,10 @@ def fit_center(points: Array, start: Array) -> CenterEstimate:
     .. math:: \min_m \sum_{tj} \rho\left(|v_{tj} - m| - \bar u_j\right),
               \qquad \bar u_j = \mathrm{mean}_t |v_{tj} - m|
 
-    This is the geometric sphere fit with options for skin markers. If the markers rotated by less
-    than `MIN_DIRECTION_RAD` in a direction, soft-tissue artefact would dominate the result. The
-    center is then left at `start` in this direction, and the direction is listed as unseen.
+    v_tj is the position of marker j in frame t, m the center and ρ a robust loss. The method is the
+    geometric sphere fit with options for skin markers. If the markers rotated by less than
+    `MIN_DIRECTION_RAD` in a direction, soft-tissue artefact would dominate the result. The center
+    is then left at `start` in this direction, and the direction is listed as unseen.
 
     Parameters
     ----------
@@ -117,9 +118,9 @@ def artefact_leverage(points: Array, center: Array, unseen: Array) -> Array:
     .. math:: L = \Big[ \mathrm{mean}_{tj}\,(d_{tj} - \bar d_j)(d_{tj} - \bar d_j)^T \Big]^+,
               \qquad d_{tj} = (v_{tj} - m) / |v_{tj} - m|
 
-    in the observed directions. L is the inverse information of a sphere fit with one observation of
-    unit variance. Frames of the same posture have the same artefact and therefore do not reduce the
-    result.
+    in the observed directions, with the symbols of `fit_center`. L is the inverse information of a
+    sphere fit with one observation of unit variance. Frames of the same posture have the same
+    artefact and therefore do not reduce the result.
 
     Parameters
     ----------
@@ -163,9 +164,10 @@ def align_vertically(found: CenterEstimate, above: Array | None) -> CenterEstima
 
 
 def joint_center(parent: ClusterTrack, child: ClusterTrack, start: Array) -> CenterEstimate:
-    """Fit the center between two body parts, in static-world coordinates, m (shape (3,)).
+    """Fit the center between two body parts, in static-world coordinates.
 
-    The markers of the distal part are first transformed to static-world coordinates of the proximal
+    `start` is the initial position and the position along unobserved directions, m, shape (3,). The
+    markers of the distal part are first transformed to static-world coordinates of the proximal
     part, in which the center is fixed. A sphere fit to these markers determines which directions
     were observed. Along these directions the center is the point that coincides in both parts. The
     sphere fit is not used for these directions, because noise in the proximal markers rotates the
@@ -194,7 +196,7 @@ def joint_center(parent: ClusterTrack, child: ClusterTrack, start: Array) -> Cen
 
 
 def _markers(track: ClusterTrack) -> Array:
-    """Return the median position over the frames of each marker in the static world, m, (k, 3)."""
+    """Return the median position of each visible marker in the static world, m, shape (k, 3)."""
     local = track.to_static(track.points)
     local = local[:, visible(local).any(axis=0)]
     return np.asarray(np.nanmedian(local, axis=0))

@@ -51,7 +51,7 @@ _BODY_POINTS = 0.1 / np.sqrt(3.0) * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1
 
 @dataclass(frozen=True, slots=True)
 class ClusterTrack:
-    """Poses of one body part over time."""
+    """Poses of one body part with k markers in m frames."""
 
     t_ns: NDArray[np.int64]
     """Time stamps, ns, shape (m,)."""
@@ -125,7 +125,8 @@ def static_cluster(track: OpticalTrack, name: str, settings: CalibrationSettings
     Raises
     ------
     CalibrationError
-        Names are missing in the stream, a marker is hardly visible, or all markers are on a line.
+        Names are missing in the stream, there are fewer than three markers, a marker or the rigid
+        body is hardly visible, or all markers are on a line.
     """
     if name not in settings.markers:
         return _static_body(track, name, settings.rigid_bodies[name])
@@ -226,8 +227,9 @@ def exchanged_labels(
 
 
 def moving_template(positions: Array) -> Array:
-    """Return marker positions on a rigid body, m, (k, 3), from a recorded movement (m, k, 3).
+    """Return the positions of k markers on a rigid body, m, shape (k, 3), from a movement.
 
+    `positions` are the measured positions in n frames, m, shape (n, k, 3); NaN where missing.
     The first frame with all markers is the initial template. All frames are aligned with the
     template, and their median is the next template. Both steps are done twice (as in generalized
     Procrustes analysis). The centroid of the result is zero.

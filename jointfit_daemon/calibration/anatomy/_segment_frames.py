@@ -309,8 +309,9 @@ def on_skin(fit: CenterEstimate) -> Array:
 
     .. math:: C + \sigma_u^2\, U^T U + \sigma_r^2 L
 
-    where the rows of U are the unobserved directions, and L = ``fit.leverage`` is the covariance
-    per m² of radial soft-tissue artefact.
+    where C is ``fit.covariance``, the rows of U are the unobserved directions, and L =
+    ``fit.leverage`` is the covariance per m² of radial soft-tissue artefact. The standard
+    deviations are σ_u = `UNSEEN_SD_M` and σ_r = `RADIAL_ARTEFACT_SD_M`.
     """
     return artefact_covariance(fit) + UNSEEN_SD_M**2 * np.asarray(fit.unseen.T @ fit.unseen)
 
@@ -363,9 +364,10 @@ def flexion_axis(
 
     .. math:: x = \arg\min_{|x|=1} \sum_t (x \cdot R_{rel}(t)\, z)^2
 
-    The result is the axis of least adduction: the normal of the great circle closest to the path of
-    z. Unlike the principal axis of the rotation vectors, it is insensitive to rotation about the
-    long axis. Such a rotation accompanies knee flexion.
+    where R_rel is the rotation of the distal part relative to the proximal part. The result is the
+    axis of least adduction: the normal of the great circle closest to the path of z. Unlike the
+    principal axis of the rotation vectors, it is insensitive to rotation about the long axis. Such
+    a rotation accompanies knee flexion.
 
     Parameters
     ----------

@@ -84,8 +84,9 @@ class LiveClusters:
 
         # The last frame.
         self.points = np.full((*shape, 3), np.nan)
-        """Markers in the last frame, optical world, m, shape (parts, k, 3); NaN if not visible, or
-        if the markers of the part do not fit the static pose."""
+        """Markers in the last frame, optical world, m, shape (parts, k, 3), where k is the largest
+        number of markers of a part; NaN if not visible, or if the markers of the part do not fit
+        the static pose."""
         self.R = np.tile(np.eye(3), (shape[0], 1, 1))
         """R_now_static of the last frame, shape (parts, 3, 3); valid only where `placed`."""
         self.p = np.zeros((shape[0], 3))
@@ -98,7 +99,8 @@ class LiveClusters:
 
         .. math:: \min_{R,t} \sum_k |R a_k + t - y_k|^2
 
-        The sum is over the visible markers (Kabsch 1976). All parts are fitted in one call.
+        The sum is over the visible markers, with positions a_k in the template and y_k in the frame
+        (Kabsch 1976). All parts are fitted in one call.
         """
         if frame.layout is not self._layout and frame.layout != self._layout:
             self._read(frame.layout)

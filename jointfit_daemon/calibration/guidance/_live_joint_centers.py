@@ -61,8 +61,8 @@ class LiveJointCenter:
     """Position in the optical world during the static pose, m, shape (3,); None without an
     estimate."""
     noise: float
-    """Random error, m: root mean variance of the observed directions; inf if no direction was
-    observed.
+    """Random error, m: root mean variance of the observed directions; inf if fewer than two
+    directions were observed.
     """
     noise_across: float
     """Random error in the two most certain directions, m. The movement of a hinge determines only
@@ -83,7 +83,8 @@ class LiveJointCenter:
     unseen: int
     """Number of unobserved directions, 0 to 3."""
     refused: str | None
-    """Reason why the estimator returned no center."""
+    """Reason why the estimator rejected or did not determine the center; None if it accepted the
+    center."""
 
 
 class LiveJointCenters:

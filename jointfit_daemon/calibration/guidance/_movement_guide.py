@@ -7,8 +7,9 @@ The movement is complete if three conditions hold:
 soft-tissue models.
 3. The shortest duration has passed.
 
-For each condition that does not hold, a message names the missing movement. When the longest
-duration has passed, the phase ends in any case, and the messages are reported.
+The guide checks the first two conditions. For each condition that is not met, a message names the
+missing movement. The recording of the phase checks the third condition. When the longest duration
+has passed, the phase ends in any case, and the messages are reported.
 """
 
 from __future__ import annotations
@@ -77,7 +78,7 @@ class MovementStatus:
 
     @property
     def ready(self) -> bool:
-        """Whether all conditions hold."""
+        """Whether all conditions that the guide checks hold."""
         return not self.missing
 
 
@@ -214,7 +215,7 @@ def _clusters(
 
 
 def _fault(name: str, part: ClusterVisibility) -> str | None:
-    """Return the problem with the markers of a body part and its remedy."""
+    """Return the problem with the markers of a body part and its remedy; None if there is none."""
     if part.absent:
         return f"{name}: the stream of the cameras has no {', '.join(part.absent)}: check the names"
     if part.misfits > MAX_MISFITS:

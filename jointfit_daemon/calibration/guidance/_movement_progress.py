@@ -68,8 +68,8 @@ class MovementProgress:
 
     For joints without markers, the error of the center is predicted from the arc φ. The prediction
     is the Cramér-Rao bound of a circle of unknown radius, ``26.8 σ / (√n φ²)``, and at least the
-    value of a full circle. n is the number of independent samples of the soft-tissue artefact,
-    which is smaller than the number of frames.
+    value of a full circle. σ is `SKIN_NOISE_M`, and n is the number of independent samples of the
+    soft-tissue artefact, which is smaller than the number of frames.
     """
 
     chain: Chain

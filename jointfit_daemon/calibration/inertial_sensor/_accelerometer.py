@@ -4,9 +4,12 @@ At rest an accelerometer measures gravity, whose magnitude is the same in every 
 
 .. math:: |M (f_i - b)| = g
 
-Nine poses determine the six parameters of bias and scale factors, with three degrees of freedom
-left. Twelve poses also determine the non-orthogonality. The faces of the housing need not be
-exactly perpendicular, because only magnitudes are used.
+where f_i is the measured specific force in pose i, b the bias, M the matrix of inverse scale
+factors and non-orthogonality, and g the standard acceleration of gravity. An error of g is common
+to all axes and does not change inclinations. Nine poses determine the six parameters of bias and
+scale factors, with three degrees of freedom left. Twelve poses also determine the
+non-orthogonality. The faces of the housing need not be exactly perpendicular, because only
+magnitudes are used.
 
 Source: Frosio, Pedersini and Borghese 2009, IEEE Trans. Instrum. Meas. 58, 2034-2041; the detection
 of static poses is from Tedaldi, Pretto and Menegatti 2014, ICRA, 3042-3049.
@@ -46,9 +49,6 @@ if TYPE_CHECKING:
     )
     from jointfit_daemon.calibration.inertial_sensor._rest_blocks import SensorReading
 
-"""Magnitude of gravity, m/s^2. An error of this value is common to all axes and does not change
-inclinations.
-"""
 POSES = 12
 """Number of poses of a complete step: six faces and six edges or corners."""
 FEWEST_POSES = 9
@@ -121,7 +121,7 @@ def fit_accelerometer(forces: Array) -> AccelerometerEstimate:
     if len(forces) < FEWEST_POSES:
         raise SensorCalibrationError(
             f"{len(forces)} static poses, expected at least {FEWEST_POSES} that differ by 20 "
-            "degrees: repeat, and let the sensor lie still for a second in each pose"
+            "degrees: repeat, and let the sensor lie still for two seconds in each pose"
         )
 
     # the off-diagonal elements are used only if the poses determine these elements

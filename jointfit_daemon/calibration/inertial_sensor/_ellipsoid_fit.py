@@ -39,8 +39,8 @@ class EllipsoidFit:
     matrix: Array
     """Symmetric matrix that maps the ellipsoid to the unit sphere, shape (3, 3)."""
     covariance: Array
-    """Covariance of the center and of the diagonal and upper off-diagonal elements of `matrix`,
-    shape (p, p).
+    """Covariance of the p parameters: the center, and the diagonal and (if fitted) upper
+    off-diagonal elements of `matrix`, shape (p, p).
     """
     residuals: Array
     """Magnitudes minus 1, shape (n,)."""

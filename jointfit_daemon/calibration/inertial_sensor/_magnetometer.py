@@ -62,8 +62,8 @@ _EVERY = 20
 _MOST_NAMES = 6
 """Largest number of directions in an error message."""
 _SPACING = 0.05
-"""Smallest difference of successive stored readings, as a fraction of their range. Readings at rest
-contain no additional information.
+"""Smallest difference of successive stored readings, as a fraction of half their mean range over
+the axes. Readings at rest contain no additional information.
 """
 _SATURATED_SHARE = 0.03
 """Fraction of readings with exactly the largest or smallest value that indicates saturation."""

@@ -39,7 +39,7 @@ class Carriers(NamedTuple):
     """Pose of the segment of every marker in every frame."""
 
     rotations: Array
-    """R_world_segment of each marker's segment, shape (T, M, 3, 3)."""
+    """R_world_segment of each marker's segment, shape (T, M, 3, 3) for T frames and M markers."""
     origins: Array
     """Origin of each marker's segment in the world, m, shape (T, M, 3)."""
     overturning: float = 0.0

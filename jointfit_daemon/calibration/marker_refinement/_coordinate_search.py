@@ -47,7 +47,7 @@ class SearchResult:
     """Result of the search."""
 
     positions: Array
-    """Marker positions on their segments, m, shape (M, 3)."""
+    """Positions of the M markers on their segments, m, shape (M, 3)."""
     errors: tuple[float, ...]
     """RMS tracking error at the start and after every accepted step, m."""
     runs: int
@@ -73,9 +73,11 @@ def search(
         Function that returns the RMS distance between measured and model markers after inverse
         kinematics, m. The inverse kinematics may start from the poses of the last call.
     start
-        Positions on their segments, m, shape (M, 3).
+        Positions of the M markers on their segments, m, shape (M, 3).
     free
         False where a coordinate is locked, shape (M, 3).
+    settings
+        First step, threshold and least decrease of the error.
     progress
         Function that is called after every pass with the largest remaining step and the error, both
         m.

@@ -32,7 +32,10 @@ if TYPE_CHECKING:
 
 
 def tracking_statistics(residuals: Array) -> TrackingStatistics:
-    """Return the statistics of residuals, m, shape (T, M, 3), NaN where missing."""
+    """Return the statistics of the residuals of T frames and M markers.
+
+    `residuals` are in m, with shape (T, M, 3), and NaN where a marker is missing.
+    """
     square = np.einsum("tmi,tmi->tm", residuals, residuals)
     seen = np.isfinite(square)
     square = np.where(seen, square, 0.0)

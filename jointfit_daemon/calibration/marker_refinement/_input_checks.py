@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 _LEAST_FRAMES = 10
 """Smallest number of frames with enough markers."""
 _UNIT_FACTOR = 100.0
-"""Size ratio of trial to model above which the length unit must be wrong."""
+"""Size ratio of trial to model, or its reciprocal, above which the length unit must be wrong."""
 _MOST_STRETCH = 1.3
-"""Size ratio of trial to model above which the refinement is refused."""
+"""Size ratio of trial to model, or its reciprocal, above which the refinement is refused."""
 _NOTED_STRETCH = 1.1
-"""Size ratio of trial to model above which a note is returned."""
+"""Size ratio of trial to model, or its reciprocal, above which a note is returned."""
 _APART_M = 0.04
 """Smallest distance of two markers of one segment that is used for the size ratio, m."""
 MOST_RMS_M = 0.08
@@ -53,7 +53,7 @@ class CheckedTrials:
 
     trials: tuple[MotionTrial, ...]
     free: NDArray[np.bool_]
-    """Coordinates that the refinement may move, shape (M, 3)."""
+    """Coordinates of the M markers that the refinement may move, shape (M, 3)."""
     notes: tuple[str, ...]
 
 

@@ -25,7 +25,7 @@ class MotionTrial:
 
     name: str
     targets: Array
-    """Measured marker positions in the world, m, shape (T, M, 3); NaN where missing."""
+    """Measured positions of M markers in T frames, world, m, shape (T, M, 3); NaN where missing."""
     rate_hz: float
 
     def thin(self, most: int) -> MotionTrial:

@@ -45,8 +45,8 @@ class RefinementProblem:
 
     model: ChainModel
     targets: Array
-    """Measured positions in the world, in the order of the model's markers, m, shape (T, M, 3); NaN
-    where missing.
+    """Measured positions in T frames, world, in the order of the model's M markers, m, shape
+    (T, M, 3); NaN where missing.
     """
     weights: Array
     """Weights of squared errors, shape (T, M); 0 where missing."""
@@ -80,7 +80,10 @@ class RefinementProblem:
         return limits_of(self.model, self.limit_m2)
 
     def excess(self, state: ChainState) -> Array | None:
-        """Return the excess of hinge angles over limits, rad, (T, nq); None without limits."""
+        """Return the excess of hinge angles over their limits, rad; None without limits.
+
+        The shape is (T, nq) for nq degrees of freedom.
+        """
         for band in self.limits:
             return np.where(band.weights > 0.0, band.excess(layout_of(self.model), state), 0.0)
         return None

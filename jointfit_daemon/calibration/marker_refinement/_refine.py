@@ -60,7 +60,8 @@ _FINE = 1e-9
 STOPPED = "stopped before convergence"
 """Value of `Refinement.stopped` if the caller ended the iteration."""
 _RISES = 2
-"""Consecutive steps without a new minimum of the hold-out error that end the iteration."""
+"""Number of consecutive steps without a new minimum of the hold-out error that ends the
+iteration."""
 
 
 def refine_markers(
@@ -83,7 +84,8 @@ def refine_markers(
     validation
         Trials that are evaluated but not fitted.
     progress
-        Function that is called after every step.
+        Function that is called after every step with the completed share, 0 to 1, and the RMS
+        error, m. The method ``search`` calls it after every pass over the coordinates.
     stop
         Function that is called after every step, and by ``search`` before every coordinate. If it
         returns true, the refinement stops and returns the result of the completed steps.

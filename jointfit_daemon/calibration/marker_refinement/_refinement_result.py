@@ -31,7 +31,7 @@ class TrackingStatistics:
     variance: float
     """Variance over time of the RMS over the markers of each frame, m²."""
     by_marker: Array
-    """RMS error of every marker, m, shape (M,); NaN if a marker is never visible."""
+    """RMS error of each of the M markers, m, shape (M,); NaN if a marker is never visible."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,8 @@ class Refinement:
     markers: tuple[MarkerOutcome, ...]
     trials: tuple[TrialOutcome, ...]
     costs: tuple[float, ...]
-    """Cost at the start and after every step. It never increases."""
+    """Cost F at the start and after every step, or with the method `search` the RMS error, m. The
+    values never increase."""
     runs: int
     """Number of runs of inverse kinematics over all frames, for the methods `search` and `block`.
     """

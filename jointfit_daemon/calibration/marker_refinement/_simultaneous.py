@@ -55,7 +55,7 @@ class RefinementStep:
 
 @dataclass(frozen=True, slots=True)
 class NormalEquations:
-    """Blocks of the normal equations for f unlocked coordinates and nq degrees of freedom."""
+    """Blocks for T frames, f unlocked coordinates and nq degrees of freedom."""
 
     A: Array
     """Pose block A_t of each frame, shape (T, nq, nq)."""
@@ -136,14 +136,18 @@ def solve_simultaneously(
     on_step: Callable[[RefinementStep], bool] | None = None,
     tolerance: float = _TOLERANCE,
 ) -> list[RefinementStep]:
-    """Refine by Gauss-Newton steps that never increase F.
+    """Refine by Gauss-Newton steps, each of which decreases F.
 
     Parameters
     ----------
+    problem
+        The objective F with its data.
     start
         Nominal positions and the poses that were fitted to them.
     on_step
         Function that is called with every accepted iterate. If it returns True, the iteration ends.
+    tolerance
+        Relative decrease of F below which the iteration ends.
 
     Returns
     -------

@@ -31,10 +31,11 @@ def compare_calibrations(new: Calibration, old: Calibration | None) -> Calibrati
 
     The first criterion in which the calibrations differ determines the result. The criteria are, in
     this order, the chain, the use of cameras, the alignment of the worlds, and all errors together.
-    An error is the hold-out error of a segment or of the flexion of an inner joint, or the gap
-    between the two centers of a joint, which are fixed in its two body parts. A hold-out error may
-    be larger by the factor 1.15 plus 0.3°, and a gap by 5 mm. A center that was estimated from the
-    movement must not be replaced by a center from another source.
+    An error is the hold-out error of a segment, the hold-out error of the flexion of an inner
+    joint, or the gap of a joint. The gap is the distance between the two centers that are fixed in
+    the two body parts of the joint. A hold-out error may be larger by the factor 1.15 plus 0.3°,
+    and a gap by 5 mm. A center that was estimated from the movement must not be replaced by a
+    center from another source.
     """
     if old is None:
         return CalibrationComparison(True, "no calibration was in force")

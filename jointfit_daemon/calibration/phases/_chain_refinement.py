@@ -158,10 +158,10 @@ def _outcome(wanted: ChainRefinement, found: Refinement, unseen: MotionTrial) ->
 def _select(
     wanted: ChainRefinement, found: Refinement, unseen: MotionTrial, refused: set[str]
 ) -> tuple[TrialOutcome, dict[str, PartQuality]]:
-    """Return the errors of the trial with the selected segments, and the errors by moved segment.
+    """Return the errors of the held-out trial, and the errors of each segment with moved markers.
 
-    The errors of a segment depend on its neighbors, so each selection of segments is evaluated as a
-    whole.
+    The refined positions are used only on the selected segments. The errors of a segment depend on
+    its neighbors, so each selection of segments is evaluated as a whole.
     """
     model = wanted.model
     shift = found.model.positions - model.positions

@@ -132,7 +132,7 @@ def _model(marked: Mapping[str, MarkerCluster]) -> ChainModel:
 
 
 def fit_shape_to_pose(cluster: MarkerCluster, shape: Array) -> MarkerCluster:
-    """Return a part with the marker positions `shape`, m, (k, 3), fitted to the static pose."""
+    """Return a part with its k markers at `shape`, m, shape (k, 3), fitted to the static pose."""
     model = _model({cluster.name: cluster}).with_markers(shape)
     placed = solve_frames(model, cluster.template[None], options=_ROBUST)
     points = shape @ placed.rotations[0, 0].T + placed.origins[0, 0] + cluster.origin

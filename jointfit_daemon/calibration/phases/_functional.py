@@ -119,8 +119,14 @@ def fit_calibration(
     alignment : PlateAlignment or None
         Alignment of the sensor worlds. With None, all sensor worlds are assumed to equal the
         optical world, and the calibration has the flag ``headings_from_static``.
+    settings : CalibrationSettings
+        Methods, markers and held-out fraction from rig.toml.
+    chain : Chain
+        The limb.
     previous : Calibration, optional
         Calibration whose lags are used where this movement determines none.
+    software : str
+        Version of the program, which the calibration contains.
     lag_ns : mapping, optional
         Configured lags, ns. The lags of other sensors are estimated.
     tracked : mapping, optional

@@ -33,7 +33,7 @@ def inertial_rotations(
     Parameters
     ----------
     raw : mapping of str to ndarray, shape (m, 4)
-        q_world_sensor of every sensor at common instants; NaN if missing.
+        q_world_sensor of every sensor at m common instants; NaN if missing.
     alignment : PlateAlignment or None
         Alignment of the sensor worlds. With None, all sensor worlds are assumed to equal the
         optical world.

@@ -141,8 +141,12 @@ def fit_offline(
     ----------
     mounts : mapping
         ``q_sensor_segment`` of each sensor, shape (4,).
+    method : str
+        Fusion method of the models.
     lengths : mapping, optional
         Length of each segment and its standard deviation, m; missing lengths remain unknown.
+    notes, software, created_utc
+        Values that are copied to the calibration.
 
     Raises
     ------

@@ -95,6 +95,10 @@ def refit_models(
         Current calibration; its ``memory`` contains the training frames.
     frames : OnlineFrames
         New frames.
+    chain : Chain
+        The limb.
+    software : str
+        Version of the program, which the quality figures contain.
 
     Returns
     -------

@@ -185,8 +185,8 @@ def with_new_static(
 
     If the markers of a segment are visible and at their earlier positions on the body, they
     determine the current orientation of the segment. Otherwise, and in the procedure of the patent,
-    the segment is assumed to have the orientation and heading of the earlier pose. If the
-    calibration contains marker clusters, it then has the flag ``same_pose_assumed``.
+    the segment is assumed to have the orientation and heading of the earlier pose. After such an
+    assumption, a calibration with marker clusters has the flag ``same_pose_assumed``.
 
     Parameters
     ----------
@@ -244,7 +244,7 @@ def with_new_static(
 
 
 def _label_exchanges(calibration: Calibration, pose: StaticPose) -> list[LabelFault]:
-    """Return exchanges of marker labels in body parts that do not fit the calibration."""
+    """Return exchanges of marker labels in body parts whose markers do not fit the calibration."""
     stored = calibration.clusters
     same = [
         name

@@ -126,7 +126,11 @@ class CalibrationStore:
         return version
 
     def _link(self, aside: Path) -> int:
-        """Link the file under the next free number; unlike a rename, this never replaces a file."""
+        """Link the file under the next free number, and return this number.
+
+        Unlike a rename, linking never replaces a file. The file is renamed only if the file system
+        has no links.
+        """
         names = (_TAKEN.fullmatch(path.name) for path in self._directory.iterdir())
         version = max((int(match[1]) for match in names if match), default=0) + 1
         while True:
@@ -154,6 +158,8 @@ class CalibrationStore:
         ------
         CalibrationFileError
             The version does not exist, or its file is damaged.
+        OSError
+            The file cannot be read.
         """
         path = self.path(version)
         if not path.exists():
@@ -181,7 +187,9 @@ class CalibrationStore:
         Raises
         ------
         CalibrationFileError
-            Versions exist, but none can be read.
+            Versions exist, but none is usable.
+        OSError
+            A file cannot be read.
         """
         notes: list[str] = []
         for version in reversed(self.versions()):

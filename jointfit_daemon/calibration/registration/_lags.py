@@ -150,9 +150,11 @@ def sensor_lags(
     Parameters
     ----------
     t_ns, q : ndarray, shapes (m,), (m, 4)
-        Time stamps, ns, and orientations of the optical body; NaN if not visible.
+        Time stamps, ns, and orientations of the optical body in m frames; NaN if not visible.
     sensors : mapping
         Sensors that are fixed to the optical body.
+    settings : LagSettings
+        Search range and thresholds of the estimates.
     """
     if not visible(q).any():
         return {}

@@ -117,10 +117,10 @@ def fit_sensor_alignment(
     With :math:`b = q_B` and :math:`v = q_W^*` the model is :math:`L(q_s) b = \pm R(q_{ref}) v`. L
     and R are the matrices of a quaternion product with the argument as left and right factor. The
     sum of squared differences over unit b and v is smallest at the first singular vectors of
-    :math:`M = \sum w_i s_i L(q_{s,i})^T R(q_{ref,i})`. The signs s and the Huber weights w are
-    computed iteratively. For ``heading``, only the columns of M for the scalar and the z component
-    of v are used. For ``mount``, q_W = 1 and q_B is a robust mean. Source: the quaternion form of
-    AX = YB, Zhuang, Roth and Sudhakar 1994.
+    :math:`M = \sum w_i s_i T_i` with :math:`T_i = L(q_{s,i})^T R(q_{ref,i})`. The signs s and the
+    Huber weights w are computed iteratively. For ``heading``, only the columns of M for the scalar
+    and the z component of v are used. For ``mount``, q_W = 1 and q_B is a robust mean. Source: the
+    quaternion form of AX = YB, Zhuang, Roth and Sudhakar 1994.
 
     Raises
     ------

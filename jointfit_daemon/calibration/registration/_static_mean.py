@@ -149,6 +149,8 @@ def static_problems(
         Robust mean of each sensor.
     still_s : float
         Duration for which all available sensors were at rest, s.
+    limits : StaticLimits, optional
+        Acceptance limits; by default the default values of `StaticLimits`.
     """
     limits = limits or StaticLimits()
     found = []

@@ -65,7 +65,7 @@ class StillnessMonitor:
         while len(steps) > 1 and t_ns - steps[1][0] >= WINDOW_NS:
             steps.popleft()
         began, start = steps[0]
-        # With irregular time stamps the steps are up to one step shorter than the window.
+        # With irregular time stamps, the steps span up to `STEP_NS` less than the window.
         if t_ns - began < WINDOW_NS - STEP_NS:
             return False
         return all(angle_between_one(start, q) < MAX_ROTATION for _, q in steps)

@@ -102,7 +102,7 @@ def fit_expert(u: Array, rho: Array, sensors: int, ways: Ways, *, tilted: bool) 
 
 
 def spread_centers(x: Array) -> Array:
-    """Return frames far from each other and from zero, shape (m, k).
+    """Select m of n frames, far from each other and from zero, shape (m, k).
 
     At most 24 frames are selected. Each step selects the frame that is farthest from its nearest
     neighbour among zero and the selected frames (farthest-point selection).

@@ -6,11 +6,11 @@ r"""Ridge regression on smooth terms and bumps (kernels); stacking combines the 
 .. math:: a_j = \arg\min_{a \ge 0,\ \sum a \le 1} \sum_i
           \bigl(\rho_{ij} - \sum_p a_p\, \hat\rho_{ijp}\bigr)^2
 
-for every axis j, where p numbers the penalties :math:`\lambda` and their ratios r. n is the number
-of frames, w are the Huber weights of the final fit, g the regressors, and :math:`\hat\rho` the
-predictions of held-out frames (stacking: Breiman 1996). Regressors are not centered, because the
-regression must have no intercept. The shares a may sum to less than 1. The part of the correction
-that does not generalize to held-out frames is then omitted.
+for every axis j. The index p counts the pairs of a penalty :math:`\lambda` and a ratio r, n is the
+number of frames, w are the Huber weights of the final fit, g the regressors, and :math:`\hat\rho`
+the predictions of held-out frames (stacking: Breiman 1996). Regressors are not centered, because
+the regression must have no intercept. The shares a may sum to less than 1. The part of the
+correction that does not generalize to held-out frames is then omitted.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Basis:
     """Scaled regressors of the training frames, and the transformation back to raw regressors."""
 
     g: Array
-    """Scaled regressors, smooth terms before whitened bumps, shape (n, p)."""
+    """Scaled regressors, smooth terms before whitened bumps, shape (n, p) for p regressors."""
     smooth: int
     """Number of smooth terms."""
     back: Array
@@ -69,7 +69,9 @@ class Basis:
         Parameters
         ----------
         smooth : ndarray, shape (n, s)
+            Smooth terms of the training frames.
         raw_bumps : ndarray, shape (n, m)
+            Bumps of the training frames.
         at_centers : ndarray, shape (m, m)
             Kernel matrix: bumps evaluated at the centers.
         """
@@ -109,7 +111,8 @@ class HeldOut:
 def choose(basis: Basis, rho: Array, groups: Masks) -> HeldOut:
     """Hold out each group in turn, and combine the predictions of all penalties for each axis.
 
-    One eigendecomposition per group and ratio is sufficient for all penalties.
+    `rho` contains the target corrections, rad, shape (n, 3), and `groups` the mask of the frames of
+    each group. One eigendecomposition per group and ratio is sufficient for all penalties.
     """
     predicted = np.empty((len(RATIOS), len(PENALTIES), *rho.shape))
     for held in groups:
@@ -140,7 +143,9 @@ def stacking_weights(predictions: Array, y: Array) -> Array:
     Parameters
     ----------
     predictions : ndarray, shape (n, p)
+        Predictions of the n targets by p fits.
     y : ndarray, shape (n,)
+        Targets.
     """
     from scipy.optimize import nnls  # noqa: PLC0415 - only fits need it, not the running daemon
 

@@ -48,8 +48,8 @@ def fit_ridge(
 ) -> Ridge:
     """Fit rho (n, k) on phi (n, p), with five iterations of Huber weights of the residual norm.
 
-    `smallest_scale` is added to the RMS of each regressor, so that a nearly constant regressor is
-    not amplified.
+    `penalty` is λ of the module's equation. `smallest_scale` is added to the RMS of each regressor,
+    so that a nearly constant regressor is not amplified.
     """
     n, p = phi.shape
     scales = np.sqrt(np.mean(phi**2, axis=0)) + smallest_scale

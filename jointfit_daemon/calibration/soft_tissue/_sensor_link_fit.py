@@ -8,10 +8,10 @@ A link predicts the relation of two sensors from posture, by a weighted sum of p
     C = \Bigl(\frac{m}{\sigma_0^2} \overline{\phi\phi^\mathsf{T}} + \tau^{-2} S^2 \Bigr)^{-1}
 
 where :math:`\sigma_0` is the RMS residual on held-out blocks and :math:`S` the diagonal matrix of
-the RMS values of the polynomials. :math:`\tau`, the RMS of the predicted quantity, is the prior
-standard deviation of the weight of a polynomial divided by its RMS (C. M. Bishop, Pattern
-Recognition and Machine Learning, 2006, section 3.3). The residuals of neighboring frames are
-similar, so the n frames count as m independent frames:
+the RMS values of the polynomials. :math:`\tau` is the RMS of the predicted quantity. It is the
+prior standard deviation of the weight of each polynomial after scaling to RMS 1 (C. M. Bishop,
+Pattern Recognition and Machine Learning, 2006, section 3.3). The residuals of neighboring frames
+are similar, so the n frames count as m independent frames:
 
 .. math:: m = n \Big/ \Bigl(1 + 2 \sum_{k=1}^{K} \rho_k \rho'_k\Bigr)
 

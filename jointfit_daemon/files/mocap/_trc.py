@@ -153,8 +153,8 @@ def _require_header(path: Path, lines: Sequence[str]) -> None:
 def write_trc(path: Path, trajectories: MarkerTrajectories) -> None:
     """Write a TRC file in metres: tabs, 8 significant digits, empty cells for missing markers.
 
-    Every data row ends with a tab. Otherwise OpenSim 4.6 rejects a row whose last marker is missing,
-    because it discards the last empty cell.
+    Every data row ends with a tab. Otherwise OpenSim 4.6 rejects a row whose last marker is
+    missing, because it discards the last empty cell.
     """
     count, markers = len(trajectories.t_s), len(trajectories.names)
     rate = format_value(trajectories.rate_hz)

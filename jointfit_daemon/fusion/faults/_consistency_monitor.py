@@ -10,7 +10,7 @@ A deviation from the predicted relation that appears within seconds is a slip, o
 disturbance if it is a rotation about the vertical. A deviation about the vertical that grows over
 minutes is heading drift. Heading errors are removed from the sensors before fusion. Only
 differences of headings are observable. The drifts of the segments are therefore defined to have the
-mean 0, and so are the drifts of the sensors of each segment.
+mean 0. The drifts of the sensors of a segment, relative to the segment, also have the mean 0.
 
 If the deviation of a pair is larger than soft tissue can cause, the soft-tissue model does not
 apply. Both sensors are then rotated towards each other by equal angles until the deviation has its

@@ -7,8 +7,9 @@ which repeat with the movement and shift the measured heading as long as the mov
 .. math:: \dot\delta = \rho,\quad \dot\rho = -\rho/\tau_\rho + w_1,\quad
           \dot b = -b/\tau_b + w_2,\quad z = \delta + b + n
 
-Rate and bias are stationary Ornstein-Uhlenbeck processes. The bias decays with the time constant
-:data:`BIAS_S`, so a persistent offset is attributed to drift.
+where z is a measurement, and w_1, w_2 and n are white noise. Rate and bias are stationary
+Ornstein-Uhlenbeck processes. The bias decays with the time constant :data:`BIAS_S`, so a persistent
+offset is attributed to drift.
 
 Invariant: without measurements the standard deviation grows. A measurement costs a few additions;
 the filter runs once per second.

@@ -37,10 +37,10 @@ REPEAT_AT_REST_NS = 400_000_000
 """
 OBSERVATION_NS = 5_000_000_000
 """Shortest time from the first sample of a sensor to a repetition at rest that counts as stuck, ns.
-Before, it is not known whether the sensor has noise.
+Before this time, it is not known whether the sensor has noise.
 """
 NATURAL_FACTOR = 3
-"""Repetitions up to this multiple of the natural repetition time are no fault."""
+"""Repetitions up to this multiple of the natural repetition time are not a fault."""
 NATURAL_LIMIT_NS = 150_000_000
 """Largest natural repetition time that is used, ns. A longer time would hide a fault."""
 PARTNER_ROTATION = radians(1.0)

@@ -72,8 +72,8 @@ class FrameAligner:
     mode : {"smooth", "fast"}
         ``smooth`` waits for samples, ``fast`` extrapolates.
     begin_ns : int, optional
-        Instant of the first frame, with or without samples, ns; by default the instant of the first
-        sample.
+        Earliest instant of the first frame, with or without samples, ns; by default the instant of
+        the first sample.
 
     Raises
     ------
@@ -218,7 +218,7 @@ class FrameAligner:
         return True
 
     def _find_servers(self) -> None:
-        """Determine whether a stream has data for the next frame, or the first instant with data.
+        """Find the first instant, from the next frame on, for which a stream has data.
 
         Streams that have ended are reset.
         """

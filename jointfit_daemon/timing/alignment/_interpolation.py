@@ -89,11 +89,13 @@ def extrapolate_orientation(
     The motion continues at the last angular rate, which is measured or computed from the last
     interval. A fraction of the angular acceleration continues for the duration of this interval:
 
-    .. math:: r(x) = v x + \tfrac12 \beta\, a\, (x_c (x_c + h_0) + (2 x_c + h_0)(x - x_c)),
+    .. math:: r(x) = v x + \beta\, d\, (x_c (x_c + h_0) + (2 x_c + h_0)(x - x_c)),
               \quad x_c = \min(x, h_0)
 
-    where *v* is the rate of the last interval, *a* the second divided difference, and :math:`\beta`
-    = 1/2. A larger :math:`\beta` follows faster motion but amplifies noise (docs/timing.md).
+    where *v* is the rate of the last interval, :math:`h_0` the length of this interval, *d* the
+    second divided difference (half the angular acceleration), and :math:`\beta` = 1/2. A larger
+    :math:`\beta` follows faster motion but amplifies noise (docs/timing.md). With measured rates,
+    the whole angular acceleration continues.
 
     Parameters
     ----------
@@ -150,10 +152,12 @@ def _agree(start: Vector, end: Vector, turn: Vector, h: float) -> bool:
 
 
 def _hermite(start: Vector, end: Vector, turn: Vector, x: float, h: float) -> Vector:
-    """Return the cubic from 0 to `turn` with the given body rates at both ends.
+    """Return the value, `x` s after the start, of a cubic from 0 to `turn` in `h` s.
 
-    The tangent at the end is the rate multiplied by the inverse right Jacobian of the rotation, ``w
-    + r x w / 2 + r x (r x w) / 12``, accurate to third order.
+    `start` and `end` are the body rates at both ends.
+
+    The tangent at the end is the rate `end` multiplied by the inverse right Jacobian of `turn`,
+    ``w + r × w / 2 + r × (r × w) / 12`` with w = `end` and r = `turn`, accurate to third order.
     """
     across = _cross(turn, end)
     twice = _cross(turn, across)

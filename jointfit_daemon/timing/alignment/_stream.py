@@ -35,9 +35,9 @@ LOST_PERIODS = 3
 LOST_LEAST_NS = 50_000_000
 """Least silence after which a stream counts as lost, ns."""
 FUTURE_NS = 100_000_000
-"""A timestamp later than the arrival by more than this is invalid, ns."""
+"""Largest time by which a valid timestamp may be later than the arrival of the sample, ns."""
 PAST_NS = 10_000_000_000
-"""A sample older than this at its arrival is too late for live use, ns."""
+"""Age at the arrival above which a sample is too late for live use, ns."""
 DELAY_MOST_NS = 250_000_000
 """Largest delay that frames wait for, ns."""
 
@@ -114,7 +114,7 @@ class Stream:
         self._counts = dict.fromkeys(SampleOutcome, 0)
         self.newest_ns = self.newest_arrival_ns = 0
         self.extrapolated = self.synced = False
-        """Whether the last result of ``at`` was extrapolated, and whether its clock had settled."""
+        """Whether the last result of ``at`` was extrapolated; whether its samples were synced."""
 
     # --- samples -----------------------------------------------------------------------------
 
@@ -131,7 +131,8 @@ class Stream:
     ) -> SampleOutcome | None:
         """Add a sample; return its outcome if it is already known.
 
-        `passed_ns` is the instant of the last emitted frame.
+        `passed_ns` is the instant of the last emitted frame, ns; None before the first frame. The
+        other parameters are described at `FrameAligner.push`.
         """
         self._received += 1
         if t_ns > arrival_ns + FUTURE_NS:
@@ -212,8 +213,9 @@ class Stream:
     def latest_wait_ns(self, t_ns: int) -> int:
         """Return the host time until which a frame without samples waits for this stream, ns.
 
-        The frame has the instant `t_ns`. It waits for the usual delay of the stream, without an
-        upper limit, until the stream counts as lost.
+        The frame has the instant `t_ns`. It waits for the usual delay of the stream, at most
+        `DELAY_MOST_NS`. While more samples are expected, it waits at least until the stream counts
+        as lost.
         """
         if self.newest_ns >= t_ns:
             return t_ns

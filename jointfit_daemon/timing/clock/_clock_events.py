@@ -63,7 +63,7 @@ def late_arrival_event(late_ns: float, seconds: float) -> ClockEvent:
     """Return the event for samples that have been late for `seconds`."""
     text = (
         f"samples have arrived {late_ns / _MS:.1f} ms late for {seconds:g} s: the device clock "
-        "stopped for that time"
+        "stopped for the duration of this delay"
     )
     return ClockEvent("clock", text, {"jump_ms": round(-late_ns / _MS, 3)})
 

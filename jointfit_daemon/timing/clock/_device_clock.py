@@ -45,7 +45,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.clock._stamps import Estimate
 
 ABSENT_LIMIT = 100
-"""Consecutive samples without their usual device time before the clock changes its source."""
+"""Number of consecutive samples without their usual device time before the clock changes its
+source."""
 CAUGHT_UP_NS = 50_000
 """Largest distance of a timestamp from its estimate at which the clock becomes synced, ns."""
 AWAY_SLACK_NS = 500_000_000
@@ -467,6 +468,6 @@ class DeviceClock:
             self.news.append(warning)
 
     def _by_arrival(self, arrival_ns: int) -> Stamp:
-        """Return the timestamp of a sample without device time among samples with device time."""
+        """Return the timestamp of a sample without usable device time, from its arrival."""
         t = arrival_ns - self.latency_ns - round(self.jitter_ns or 0.0)
         return Stamp(self._line.forward(t), float(self._period_ns), synced=False, epoch=self.epoch)

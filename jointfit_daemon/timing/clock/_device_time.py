@@ -41,7 +41,7 @@ _BACKLOG_NS = 100_000_000
 """Least delay of a backlog, ns, and tolerance of the first sample after the backlog."""
 _WRAP_SLACK = 8
 """Largest accepted difference, counts, between the change of the counter and the elapsed time at
-the first wrap. If a quarter of the elapsed time is larger, it is the limit.
+the first wrap. If a quarter of the elapsed time is larger, this quarter is the limit.
 """
 _LATE = 0.65
 """Delay from which a sample counts as late, periods."""
@@ -136,7 +136,10 @@ class TickTime:
         self, ticks: int | None, counter: int | None, arrival_ns: int,
         envelope: MinimumDelayFilter, echo: EchoFit | None = None,
     ) -> int | None:  # fmt: skip
-        """Return the device time, ns; None if the device restarted."""
+        """Return the device time, ns; None if the device restarted.
+
+        The clock fits `envelope` and `echo` show whether a backlog of samples has ended.
+        """
         if ticks is None:
             return None
         last = self._last

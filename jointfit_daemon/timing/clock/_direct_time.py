@@ -54,7 +54,7 @@ class HostTime(Protocol):
 
     @property
     def slope(self) -> float:
-        """d(host - own) / d own."""
+        """Derivative of host time minus own time with respect to own time, dimensionless."""
 
     @property
     def settled(self) -> bool:
@@ -111,7 +111,7 @@ class SyncEdgeFit:
 
     @property
     def slope(self) -> float:
-        """d(host - device) / d device."""
+        """Derivative of host time minus device time with respect to device time, dimensionless."""
         return self._line.slope + self.reference.slope
 
     @property

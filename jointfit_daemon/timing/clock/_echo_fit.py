@@ -46,7 +46,11 @@ class _Echo(NamedTuple):
 
 
 class EchoFit:
-    """Line through the echoes of the last two minutes."""
+    """Line through the echoes of the last two minutes.
+
+    An echo has the server time `u`, and was sent and received at the host times `sent_ns` and
+    `received_ns`, ns.
+    """
 
     __slots__ = (
         "_doubtful", "_echoes", "_line", "_ref", "_theta_ref", "bound_ns", "echoes", "slope",
@@ -58,7 +62,7 @@ class EchoFit:
         self._ref = self._theta_ref = 0
         self._line = FittedLine(0.0, 0.0, inf, 0.0, SKEW_SD**2)
         self.slope = 0.0
-        """d theta / d host time; positive when the server clock runs fast."""
+        """Derivative of theta with respect to host time; positive if the server clock runs fast."""
         self.bound_ns = inf
         """Limit of the constant error, which is half the smallest round-trip time, ns."""
         self.echoes = 0

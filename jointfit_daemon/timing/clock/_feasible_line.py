@@ -140,9 +140,9 @@ def _on_time(
 ) -> Sequence[Point]:
     """Return the points that were not delayed by congestion.
 
-    Heights are measured above the hull. Its outer edges are omitted if they end at a delayed point,
-    that is, if their slope is outside of the likely range from `near` to `far`. There the hull is
-    continued with the limit of this range.
+    Heights are measured above the hull. An outer edge of the hull ends at a delayed point if its
+    slope is outside the likely range from `near` to `far`. The hull is continued in place of such
+    an edge with the slope `near` on the left or `far` on the right.
     """
     u0, tilt = points[0][0], _slope(points[0], points[-1])
     rests = [y - tilt * (u - u0) for u, y in points]

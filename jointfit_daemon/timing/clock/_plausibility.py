@@ -30,7 +30,7 @@ intervals must agree.
 JITTER_NS = 25_000_000
 """Largest mean delay above the fastest samples, ns, that a paused clock explains."""
 EARLY_SAMPLES = 3
-"""Early samples in a row that indicate a clock jump."""
+"""Number of early samples in a row that indicates a clock jump."""
 
 _INTERVAL_NS = LATE_FOR_NS // INTERVALS
 

@@ -16,9 +16,9 @@ UNAMBIGUOUS = 0.35
 FARTHEST_NS = 20_000_000
 """Largest distance of two estimates of one edge, ns."""
 _INSTANTS = 512
-"""Reference instants in memory; the older half is dropped on overflow."""
+"""Largest number of reference instants in memory. Above it, the older half is dropped."""
 _WAITING = 64
-"""Unmatched edges in memory per device."""
+"""Largest number of unmatched edges in memory for each device."""
 
 
 class Edge(NamedTuple):

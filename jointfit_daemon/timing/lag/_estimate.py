@@ -2,17 +2,18 @@ r"""Lag of an IMU behind motion capture, estimated from angular rates.
 
 The estimate needs no world frame, heading, gravity or sensor-to-segment alignment, so it precedes
 all other fits. The result contains a standard deviation, and the reason of a rejection if the data
-do not determine the lag. The conditions are in ``_gate``; only a failed search is rejected here, in
-`coarse_lags`.
+do not determine the lag. The conditions for motion and fit are in ``_gate``. Missing data and a
+failed search (`coarse_lags`) are rejected here.
 
 Two rigidly connected bodies have the same angular rate up to a constant rotation and a gyro bias,
 
 .. math:: g(t + \tau) = R\,\omega(t) + b + n ,
 
-where g and omega are in the respective body frames. The lag tau is the **IMU timestamp minus the
-mocap timestamp of the same event**, so it is positive if the IMU is later. To align the systems,
-subtract the lag from the IMU timestamps. The lag contains all delays that the clocks cannot
-observe: constant transport delay, filters in both systems, and exposure conventions.
+where g is the rate of the IMU and omega the rate from motion capture, each in its own body frame, R
+is the rotation, b the bias and n the noise. The lag tau is the **IMU timestamp minus the mocap
+timestamp of the same event**, so it is positive if the IMU is later. To align the systems, subtract
+the lag from the IMU timestamps. The lag contains all delays that the clocks cannot observe:
+constant transport delay, filters in both systems, and exposure conventions.
 """
 
 from __future__ import annotations
@@ -88,7 +89,9 @@ class LagEstimate:
     acceleration_rms: float = nan
     """RMS angular acceleration of the reference, rad/s²."""
     mean_weight: float = nan
+    """Mean Huber weight of the residuals, 0 to 1."""
     valid_share: float = nan
+    """Covered fraction of the duration, of the track with more gaps."""
     pairs: int = 0
     """Number of compared rates."""
 

@@ -41,9 +41,11 @@ class LagSettings:
     span_s: float = 0.15
     """Largest lag in the search, s; use 3 s if a clock is not mapped to host time."""
     step_s: float = 0.004
+    """Step of the search, s."""
     cutoff_hz: float = 10.0
-    """Low-pass cut-off for both rates, Hz; at most 0.4 of the lower sample rate."""
+    """Low-pass cut-off for both rates, Hz. It is limited to 0.4 of the lower sample rate."""
     bridge_s: float = BRIDGE_S
+    """Longest gap of the orientations that is bridged, s."""
     stamp_sd_ns: float = 144_000.0
     """Standard deviation of the sawtooth error of the timestamps, ns. The default is a tick of 0.5
     ms divided by sqrt(12). Use 0 if the timestamps are exact.

@@ -23,7 +23,7 @@ GATE_SIGMAS = 4.0
 `LagSettings` contains the thresholds for a single window.
 """
 STEP_WINDOWS = 3
-"""Number of successive windows beyond this threshold, with consistent lags, that are a step."""
+"""Number of successive windows beyond `GATE_SIGMAS`, with consistent lags, that are a step."""
 AGREE_NS = 500_000.0
 """Largest range of consistent lags, ns."""
 
@@ -35,7 +35,10 @@ class TrackedLag:
     lag_ns: float
     sigma_ns: float
     drift: float
-    """d lag / dt, dimensionless; a value above 2e-6 indicates a faulty clock fit."""
+    """Derivative of the lag with respect to time, dimensionless.
+
+    A value above 2e-6 indicates a faulty clock fit.
+    """
     drift_sigma: float
     step_ns: float | None = None
     """Size of the step, if this window confirmed one, ns."""

@@ -76,6 +76,8 @@ class MotionScript:
         self._motions = motions
         self._transition_s = transition_s
         self._layers: list[tuple[float, str]] = []
+        self._at_once: set[tuple[float, str]] = set()
+        """Layers that begin without a blend."""
         for step in steps:
             self._check(step.name)
             self._layers.append((start_s, step.name))
@@ -87,9 +89,14 @@ class MotionScript:
         if name not in self._motions:
             raise UnknownMotionError(f"no motion {name!r}; there are: {', '.join(self._motions)}")
 
-    def play(self, name: str, t_s: float) -> None:
-        """Start the motion `name` at the time `t_s`; discard later steps."""
+    def play(self, name: str, t_s: float, *, at_once: bool = False) -> None:
+        """Start the motion `name` at the time `t_s`, without a blend if `at_once`.
+
+        Later steps are discarded.
+        """
         self._check(name)
+        if at_once:
+            self._at_once.add((t_s, name))
         earlier = [layer for layer in self._layers if layer[0] < t_s]
         self._layers = [*(earlier or self._layers[:1]), (t_s, name)]
 
@@ -101,19 +108,25 @@ class MotionScript:
     def discard_before(self, t_s: float) -> None:
         """Discard the motions that have no effect from `t_s` on."""
         covered = [
-            i for i, (start, _) in enumerate(self._layers) if start + self._transition_s <= t_s
+            i for i, layer in enumerate(self._layers) if layer[0] + self._blend_s(layer) <= t_s
         ]
         if covered:
             del self._layers[: covered[-1]]
+
+    def _blend_s(self, layer: tuple[float, str]) -> float:
+        return 0.0 if layer in self._at_once else self._transition_s
 
     def coordinates(self, t_s: Array) -> Array:
         """Return the coordinates, shape (n, COORDINATES), at the times `t_s` of shape (n,)."""
         start, name = self._layers[0]
         blended = self._motions[name](t_s - start)
-        for start, name in self._layers[1:]:
+        for layer in self._layers[1:]:
+            start, name = layer
             begun = t_s > start
             if not np.any(begun):
                 break
-            share = smootherstep((t_s[begun] - start) / self._transition_s)[:, None]
+            blend_s = self._blend_s(layer)
+            since = t_s[begun] - start
+            share = smootherstep(since / blend_s if blend_s else np.ones_like(since))[:, None]
             blended[begun] += share * (self._motions[name](t_s[begun] - start) - blended[begun])
         return blended

@@ -151,8 +151,16 @@ class RecordedSubject:
         """Duration and bones of the trial, for the ground-truth log."""
         return {"trial_s": self._recording.seconds, "bones": list(self._bones)}
 
-    def play(self, name: str, t_s: float) -> None:
-        """Start ``stand``, ``trial`` or a part of the trial; raise UnknownMotionError otherwise."""
+    def play(self, name: str, t_s: float, *, at_once: bool = False) -> None:
+        """Start ``stand``, ``trial`` or a part of the trial, always with a blend.
+
+        Raises
+        ------
+        UnknownMotionError
+            `name` is another motion, or the motion should start at once.
+        """
+        if at_once:
+            raise UnknownMotionError("the motions of a trial always begin with a blend")
         part = _MOTION.fullmatch(name)
         if part is None:
             raise UnknownMotionError(

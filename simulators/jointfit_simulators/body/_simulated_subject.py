@@ -168,9 +168,9 @@ class SimulatedSubject:
             "markers_m": {part: points.tolist() for part, points in self.templates.items()},
         }
 
-    def play(self, name: str, t_s: float) -> None:
+    def play(self, name: str, t_s: float, *, at_once: bool = False) -> None:
         """Start another motion; raise UnknownMotionError for an unknown name."""
-        self._script.play(name, t_s)
+        self._script.play(name, t_s, at_once=at_once)
 
     def motion_at(self, t_s: float) -> str:
         """Return the name of the motion at the time `t_s`."""

@@ -71,8 +71,14 @@ class InstrumentedSubject(Protocol):
     def facts(self) -> Mapping[str, object]:
         """Constant properties for the log of the ground truth, as JSON values."""
 
-    def play(self, name: str, t_s: float) -> None:
-        """Start another motion; raise UnknownMotionError for an unknown name."""
+    def play(self, name: str, t_s: float, *, at_once: bool = False) -> None:
+        """Start another motion, without a blend if `at_once`.
+
+        Raises
+        ------
+        UnknownMotionError
+            There is no motion with this name.
+        """
 
     def motion_at(self, t_s: float) -> str:
         """Return the name of the motion at the time `t_s`."""

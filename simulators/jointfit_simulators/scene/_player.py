@@ -39,6 +39,9 @@ TRUTH_NS = NS_PER_S // 100
 _FLUSH_NS = NS_PER_S // 10
 """Time between two writes to the log of the ground truth, ns."""
 
+_AT_ONCE = " at-once"
+"""End of the command for a motion that begins without a blend."""
+
 
 class PlannedStream(Protocol):
     """Stream with planned samples."""
@@ -98,9 +101,18 @@ class ScenePlayer:
         """Return the name of the current motion."""
         return self._subject.motion_at((time.monotonic_ns() - self._origin_ns) / NS_PER_S)
 
-    def play(self, name: str) -> None:
-        """Start a motion at the next block; raise UnknownMotionError for an unknown name."""
-        self._subject.play(name, (self._planned_ns - self._origin_ns) / NS_PER_S)
+    def play(self, words: str) -> None:
+        """Start a motion at the next block; raise UnknownMotionError for an unknown name.
+
+        Parameters
+        ----------
+        words
+            Name of the motion. With the word ``at-once`` after it, the motion begins without a
+            blend.
+        """
+        name = words.removesuffix(_AT_ONCE)
+        t_s = (self._planned_ns - self._origin_ns) / NS_PER_S
+        self._subject.play(name, t_s, at_once=name != words)
 
     async def run(self) -> None:
         """Send the samples of all streams until cancelled."""

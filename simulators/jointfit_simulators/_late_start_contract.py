@@ -1,0 +1,65 @@
+"""Test of the conformance suite for a decoder that starts while the device streams."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any, ClassVar
+from unittest import SkipTest
+
+from jointfit_daemon.model import Chunk
+from jointfit_simulators._contract_fixtures import DecodingReceiver, expected_text, require
+from jointfit_simulators.imu_device import clean_wire
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jointfit_daemon.driver import Driver
+
+_LATER = 5
+"""Number of samples for a decoder that starts later."""
+
+
+class LateStartContract:
+    """Part of `jointfit_simulators.driver_contract.DriverContract`."""
+
+    has_history: ClassVar[bool] = False
+    """Whether samples depend on many earlier samples, as those of an orientation filter."""
+
+    def test_a_decoder_that_starts_later_needs_the_description(self: Any, tmp_path: Path) -> None:
+        """A recording that starts while the device streams begins with the description."""
+        if self.has_history:
+            raise SkipTest("the orientation filter begins again")
+
+        async def scene() -> None:
+            device, driver = self.make_device(tmp_path, clean_wire), self.make_driver(tmp_path)
+            async with self.streaming(device, driver) as (receiver, first):
+                numbers = (await self._send_all(device, receiver, first, 20))[-_LATER:]
+
+            found = decode_later(driver, receiver, _LATER)
+            require(len(found) == len(numbers), "the later decoder must return all samples")
+            for number, item in zip(numbers, found, strict=True):
+                require(self.matches(number, item), expected_text(item, number))
+
+        asyncio.run(scene())
+
+
+def decode_later(driver: Driver, receiver: DecodingReceiver, count: int) -> list[Any]:
+    """Return the last `count` measurements from a decoder that receives only the last chunks.
+
+    Before these chunks it receives the description of the data, or, from a decoder without
+    description, the chunks before the first measurement.
+    """
+    again, opening, begin = receiver.restarted(driver), [], 0
+    for place, chunk in enumerate(receiver.chunks):
+        if len(receiver.measurements) - len(again.measurements) > count:
+            begin = place
+        again.emit(chunk)
+        if not again.measurements:
+            opening.append(chunk.data)
+
+    later = receiver.restarted(driver)
+    for data in getattr(receiver.decoder, "description", opening):
+        later.emit(Chunk(receiver.chunks[begin].t_ns, data))
+    for chunk in receiver.chunks[begin:]:
+        later.emit(chunk)
+    return later.measurements[-count:]
