@@ -36,6 +36,8 @@ _FORBIDDEN = "+#/"
 _FOLDER = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _LONGEST_M = 3.0
 """Upper limit of a segment length, m; larger numbers are probably millimetres."""
+_FARTHEST_M = 100.0
+"""Upper limit of a coordinate of the fixed origin, m; larger numbers are probably millimetres."""
 _STANDARD_MAX = 0x7FF
 """Largest 11-bit CAN identifier."""
 _LEAST_PLANAR = 2
@@ -146,7 +148,15 @@ def _check_values_by_name(table: ChainTable) -> Iterator[Fault]:
         if table.segments:
             yield from check_known_name(f"chain.lengths_m.{name}", name, table.segments, "segment")
         if length is not None and not 0 < length < _LONGEST_M:
-            yield Fault(f"chain.lengths_m.{name}", "expected a length in metres", length)
+            yield Fault(
+                f"chain.lengths_m.{name}",
+                f"expected a length in metres, below {_LONGEST_M:g}",
+                length,
+            )
+    origin: Any = table.origin_m or ()
+    if any(value is not None and not abs(value) < _FARTHEST_M for value in origin):
+        text = f"expected a position in metres, closer than {_FARTHEST_M:g}"
+        yield Fault("chain.origin_m", text, list(origin))
     joints, segments = table.joints or (), table.segments or ()
     complete = len(joints) == len(segments) + 1
     inner = joints[1:-1] if complete else joints  # only joints between two segments have angles

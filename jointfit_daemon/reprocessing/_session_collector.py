@@ -14,7 +14,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.model import ANGLE_NAMES, LimbState, MocapFrame, OpticalState
+from jointfit_daemon.model import (
+    ANGLE_NAMES,
+    FrameFlag,
+    FusionMode,
+    LimbState,
+    MocapFrame,
+    OpticalState,
+)
 from jointfit_daemon.pipeline.events import CalibrationStatus, ChunkArrived, Notice, UnixOffset
 from jointfit_daemon.session_data import (
     JointSeries,
@@ -88,6 +95,8 @@ class SessionCollector:
         self._optical_segments: dict[str, _Rows] = {}
         self._optical_joints: dict[str, tuple[AngleConvention, _Rows]] = {}
         self._latencies_ns = array("q")
+        self._measured_origins: list[bool] = []
+        """For each limb state, whether cameras measured the position of the limb."""
         self._events: list[tuple[int, TimelineEvent]] = []
 
     def add_measurement(self, source: str, item: StampedMeasurement) -> None:
@@ -133,10 +142,14 @@ class SessionCollector:
             self._segments.setdefault(segment.name, _Rows(5)).add(
                 state.t_ns, segment.q_world_segment or _UNKNOWN_Q, (_number(segment.sd),)
             )
+        measured = (
+            state.mode is FusionMode.IMU_AND_MOCAP and FrameFlag.ORIGIN_FIXED not in state.flags
+        )
+        self._measured_origins.append(measured)
         for joint in state.joints:
-            _, rows = self._joints.setdefault(joint.name, (joint.convention, _Rows(8)))
+            _, rows = self._joints.setdefault(joint.name, (joint.convention, _Rows(9)))
             sds = (_number(joint.angle_sd), _number(joint.position_sd))
-            rows.add(state.t_ns, *_angles_and_position(joint), sds)
+            rows.add(state.t_ns, *_angles_and_position(joint), sds, (float(measured),))
 
     def _add_optical(self, state: OpticalState) -> None:
         for segment in state.segments:
@@ -196,6 +209,14 @@ class SessionCollector:
         """
         begin_ns = self._begin_ns or 0
         timeline = sorted(self._events, key=lambda item: item[0])
+        if 0 < (count := sum(self._measured_origins)) < len(self._measured_origins):
+            unknown = len(self._measured_origins) - count
+            text = (
+                f"the cameras did not measure the position of the limb in {unknown} of "
+                f"{len(self._measured_origins)} frames, so these positions are unknown"
+            )
+            data = {"unknown": unknown, "frames": len(self._measured_origins)}
+            timeline.insert(0, (begin_ns, TimelineEvent(0.0, "positions", text=text, data=data)))
         segments = {
             name: segment
             for segment, group in zip(rig.chain.segments, rig.chain.sensors, strict=True)
@@ -260,6 +281,12 @@ def _joint_series(
     position_sd = None
     if sds:
         angle_sd, position_sd = rows.known_columns(6, 1), rows.known_columns(7, 1)
+        # Positions from the fixed origin and from the cameras differ by an unknown vector.
+        measured = rows.columns(8, 1).ravel() > 0.0
+        if position is not None and measured.any():
+            position[~measured] = nan
+            if position_sd is not None:
+                position_sd[~measured] = nan
     main = "elevation" if "elevation" in names else "flexion"
     return JointSeries(
         name,

@@ -9,6 +9,7 @@ Invariant: a handler that refuses a request changes nothing.
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Protocol
@@ -122,7 +123,8 @@ class RequestHandlers:
         calibration phase is running.
         """
         rig, rate_hz = self._daemon.rig, float(str(request.arguments["hz"]))
-        fastest_hz = max(s.rate_hz for s in rig.sources if s.kind == "imu")
+        # A planar rig has no sensors, and its cameras determine the instants of the results.
+        fastest_hz = max((s.rate_hz for s in rig.sources if s.kind == "imu"), default=math.inf)
         fault = None
         if rate_hz > fastest_hz:
             expected = f"expected at most {fastest_hz:g}, the sample rate of the fastest sensor"

@@ -24,10 +24,11 @@ File = Annotated[
     ),
 ]
 To = Annotated[
-    str,
+    list[str],
     typer.Option(
         "--to",
-        help="Format: trc, c3d, sto, mot, csv, parquet, xdf, bids-motion, mcap-foxglove.",
+        help="Format: trc, c3d, sto, mot, csv, parquet, xdf, bids-motion, mcap-foxglove."
+        " Repeatable.",
     ),
 ]
 Out = Annotated[Path, typer.Option("--out", help="Output folder, created if missing.")]
@@ -52,26 +53,33 @@ def export(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Write a recording or a trial in a format of OpenSim, pandas, MNE, Foxglove and others.
+    """Write a recording or a trial in formats of OpenSim, pandas, MNE, Foxglove and others.
 
-    Reports what is left out or resampled. If the export fails, no file is written.
+    Reports what is left out or resampled. If the export to a format fails, no file of this format
+    is written.
     """
     from jointfit_daemon.files.sessions import SESSION_FORMATS, write_session
 
-    check_choice("--to", to, [*SESSION_FORMATS])
+    for form in to:
+        check_choice("--to", form, [*SESSION_FORMATS])
     with show_activity("reading"):
         session = load_data(file)
     names = _read_names(name or (), session)
     out.mkdir(parents=True, exist_ok=True)
     with show_activity("writing"):
-        written = write_session(session, out, to, names=names, overwrite=force)
+        written = [
+            write_session(session, out, form, names=names, overwrite=force)
+            for form in dict.fromkeys(to)
+        ]
 
+    files = [str(path) for each in written for path in each.files]
+    notes = [note for each in written for note in each.notes]
     if json:
-        echo_json({"files": [str(path) for path in written.files], "notes": written.notes})
+        echo_json({"files": files, "notes": notes})
         return
-    for note in written.notes:
+    for note in notes:
         typer.echo(f"note: {note}", err=True)
-    for path in written.files:
+    for path in files:
         typer.echo(path)
 
 

@@ -173,7 +173,12 @@ def test_ten_faults_are_reported_together(
         (("imu", 2, "can"), None, "imu[S3].can: missing"),
         (("imu", 3, "ids", "quaternoin"), 5, "did you mean 'quaternion'?"),
         (("chain", "segments"), ["thigh", "thigh"], "named 2 times"),
-        (("chain", "lengths_m"), {"shank": 420}, "expected a length in metres"),
+        (("chain", "lengths_m"), {"shank": 420}, "expected a length in metres, below 3"),
+        (
+            ("chain", "origin_m"),
+            [0.0, 0.0, 900.0],
+            "expected a position in metres, closer than 100",
+        ),
         (("chain", "angles"), {"kne": "trunk"}, "did you mean 'knee'?"),
         (
             ("chain", "angles"),

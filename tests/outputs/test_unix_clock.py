@@ -126,6 +126,9 @@ class Listening:
         self.heard.append(event)
         return []
 
+    def descriptions(self) -> dict[str, tuple[bytes, ...]]:
+        return {}
+
     def health(self, now_ns: int) -> CoreHealth:  # noqa: ARG002 - the shape of a core
         return CoreHealth()
 

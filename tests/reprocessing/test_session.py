@@ -9,8 +9,18 @@ import numpy as np
 import pytest
 
 from jointfit_daemon.config import parse_rig
+from jointfit_daemon.model import (
+    FrameFlag,
+    FusionMode,
+    JointAngles,
+    JointState,
+    LimbState,
+    SyncState,
+)
 from jointfit_daemon.outputs.recording import PROGRAM, _session_writer
+from jointfit_daemon.pipeline.events import Tick
 from jointfit_daemon.reprocessing import ReprocessingError, load_session
+from jointfit_daemon.reprocessing._session_collector import SessionCollector
 from tests.pipeline import core_feed
 from tests.pipeline.core_feed import BEGIN_NS, SENSORS
 from tests.reprocessing.recorded_run import (
@@ -83,6 +93,32 @@ def test_marks_phases_and_losses_are_on_the_time_line(session: SessionData) -> N
     assert found["calibration", "static"].t_s == pytest.approx(0.2)
     assert ("device", "S1") in found
     assert ("reload", "r") in found
+
+
+def test_positions_from_the_fixed_origin_are_unknown_beside_measured_positions() -> None:
+    """Positions of both kinds in one column would jump by the distance of the origins."""
+    collector = SessionCollector()
+    hip = JointState("hip", (0.0, 0.0, 0.9), 0.002, JointAngles(0.1, 0.0, 0.0))
+    modes: list[tuple[FusionMode, tuple[str, ...]]] = [
+        (FusionMode.IMU_AND_MOCAP, ()),
+        (FusionMode.IMU_AND_MOCAP, (FrameFlag.ORIGIN_FIXED,)),
+        (FusionMode.IMU, ()),
+        (FusionMode.IMU_AND_MOCAP, ()),
+    ]
+    for number, (mode, flags) in enumerate(modes):
+        t_ns = BEGIN_NS + 10_000_000 * number
+        state = LimbState(number, t_ns, t_ns, mode, SyncState.LOCKED, flags, (), (hip,))
+        collector.add_event(Tick(t_ns), [state])
+    found = collector.session(parse_rig(rig_table()), {}, {})
+    (joint,) = found.joints
+    assert joint.position is not None
+    assert joint.position_sd is not None
+    assert np.isnan(joint.position[:, 0]).tolist() == [False, True, True, False]
+    assert np.isnan(joint.position_sd).tolist() == [False, True, True, False]
+    assert np.isfinite(joint.angles["flexion"]).all()
+    (event,) = found.events
+    assert event.kind == "positions"
+    assert "in 2 of 4 frames" in event.text
 
 
 def test_calibration_given_is_in_force_from_the_first_frame(run: RecordedRun) -> None:

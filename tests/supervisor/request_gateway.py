@@ -29,6 +29,12 @@ if TYPE_CHECKING:
 BASE = "jointfit/bench-1"
 
 
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {_toml(each)}" for key, each in value.items()) + "}"
+    return json.dumps(value)
+
+
 class Running:
     """A daemon in this process without a broker, and what it publishes."""
 
@@ -46,7 +52,7 @@ class Running:
         for name, part in rig.items():
             for section in part if isinstance(part, list) else [part]:
                 text.append(f"[[{name}]]" if isinstance(part, list) else f"[{name}]")
-                text += [f"{key} = {json.dumps(value)}" for key, value in section.items()]
+                text += [f"{key} = {_toml(value)}" for key, value in section.items()]
         (self.folder / "rig.toml").write_text("\n".join(text), encoding="utf-8")
 
     @contextlib.asynccontextmanager

@@ -124,6 +124,9 @@ class ReadyCore:
             return [CalibrationReady(self.calibration), status]
         return []
 
+    def descriptions(self) -> dict[str, tuple[bytes, ...]]:
+        return {}
+
     def health(self, now_ns: int) -> CoreHealth:  # noqa: ARG002 - the core's interface
         return CoreHealth()
 

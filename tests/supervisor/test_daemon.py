@@ -79,6 +79,9 @@ class RecordingCore:
             return [event.reply("accepted", dict(event.arguments))]
         return self.answers.pop(type(event), [])
 
+    def descriptions(self) -> dict[str, tuple[bytes, ...]]:
+        return {}
+
     def health(self, now_ns: int) -> CoreHealth:  # noqa: ARG002 - the core's interface
         return CoreHealth()
 

@@ -407,3 +407,23 @@ async def test_the_self_test_reports_absent_devices_and_a_full_disk_with_remedie
         "error", "error", "warning",
     ]  # fmt: skip
     assert all(check["remedy"] or check["level"] == "ok" for check in data["checks"])
+
+
+async def test_the_rate_of_a_rig_without_sensors_has_no_limit_of_sensors(tmp_path: Path) -> None:
+    rig = {
+        "rig": {"name": "bench-1"},
+        "chain": {
+            "joints": ["hip", "knee", "ankle"], "segments": ["thigh", "shank"],
+            "proximal": "pelvis", "distal": "foot", "motion": "planar",
+        },
+        "mocap": {
+            "driver": "natnet", "server": "127.0.0.1",
+            "markers": {
+                "pelvis": ["P1"], "thigh": ["T1", "T2"], "shank": ["C1", "C2"], "foot": ["F1"],
+            },
+        },
+    }  # fmt: skip
+    gateway = Running(tmp_path, rig)
+    async with gateway.run():
+        reply = await gateway.ask("rate", {"hz": 50.0})
+        assert reply.data == {"before_hz": 100.0, "output_rate_hz": 50.0}

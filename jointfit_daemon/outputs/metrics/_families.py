@@ -36,9 +36,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.health import DeviceHealth
 
 _CLOCK_STATES = ("settling", "direct", "echo", "passive", "arrival", "stale")
-_STARTED_S = time.time_ns() * S_PER_NS - time.process_time()
-"""UNIX time at which this process started, s. It is not read from /proc/stat, because the systemd
-option ProcSubset hides this file."""
+_START_FIELD = 19
+"""Place of the start time after the name of the program in /proc/self/stat, in clock ticks."""
 _Device = dict[str, tuple[str, "Callable[[DeviceHealth], float | None]"]]
 
 _COUNTERS: _Device = {
@@ -83,6 +82,17 @@ _GAUGES: _Device = {
     ),
 }
 """Gauges of a device, by name without prefix. The value is None while it is unknown."""
+
+
+def _process_start_s() -> float:
+    """Return the UNIX time at which this process started, s.
+
+    The boot time is not read from /proc/stat, because the systemd option ProcSubset hides this
+    file.
+    """
+    fields = Path("/proc/self/stat").read_bytes().rpartition(b")")[2].split()
+    since_boot_s = int(fields[_START_FIELD]) / os.sysconf("SC_CLK_TCK")
+    return time.time_ns() * S_PER_NS - time.clock_gettime(time.CLOCK_BOOTTIME) + since_boot_s
 
 
 def metric_families(rig: str, health: BridgeHealth, frames: FrameStatistics) -> Iterator[Metric]:
@@ -229,7 +239,11 @@ def _process(health: BridgeHealth) -> Iterator[Metric]:
             "Recorded data not yet written.",
         ),
         ("process_resident_memory_bytes", _resident_bytes(), "Resident memory."),
-        ("process_start_time_seconds", _STARTED_S, "UNIX time of the start of the process."),
+        (
+            "process_start_time_seconds",
+            _process_start_s(),
+            "UNIX time of the start of the process.",
+        ),
     )
     for name, found, help_text in gauges:
         gauge = GaugeMetricFamily(name, help_text)

@@ -127,10 +127,14 @@ class SpoolFiles:
         if self._sizes[number] >= self._keep_bytes // FILES:
             self._open = None
 
-        while self.size_bytes > self._keep_bytes and len(self._counts) > 1:
-            oldest = next(iter(self._counts))
-            self.dropped += self._counts[oldest]
-            self.remove(oldest)
+        # The messages are stored already, so a failed deletion is no error: the next call repeats
+        # it.
+        with contextlib.suppress(OSError):
+            while self.size_bytes > self._keep_bytes and len(self._counts) > 1:
+                oldest = next(iter(self._counts))
+                count = self._counts[oldest]
+                self.remove(oldest)
+                self.dropped += count
 
     def oldest(self) -> tuple[int, list[SpooledMessage]] | None:
         """Return number and messages of the oldest file; this file gets no further messages.

@@ -56,6 +56,25 @@ def test_the_oldest_messages_of_a_full_spool_are_deleted_and_counted(tmp_path: P
     assert len(found) > 100
 
 
+def test_messages_are_stored_once_although_an_old_file_cannot_be_deleted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = SpoolFiles(tmp_path, 16_000)
+
+    def refuse(_: object, number: int) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(number))
+
+    with monkeypatch.context() as failing:
+        failing.setattr(SpoolFiles, "remove", refuse)
+        for number in range(300):
+            files.append([message(number)])
+    assert files.dropped == 0
+    files.append([message(300)])
+    found = taken(files)
+    assert found == [message(number) for number in range(301 - len(found), 301)]
+    assert files.dropped == 301 - len(found) > 0
+
+
 @pytest.mark.parametrize("cut", [1, 2, 30, 60, 95])
 def test_a_line_that_a_power_cut_tore_is_counted_and_skipped(tmp_path: Path, cut: int) -> None:
     before = SpoolFiles(tmp_path, 100_000)
