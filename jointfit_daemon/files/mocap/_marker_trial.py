@@ -121,7 +121,9 @@ def read_marker_trial(path: Path, up_axis: Axis | None = None) -> MarkerTrial:
         found = read_c3d(path)
         trajectories, declared, custom = found.trajectories, found.up_axis, "z"
     else:
-        raise MalformedFileError(f"{path}: expected a file that ends in .trc or .c3d")
+        recorded = path.is_dir() or ".mcap" in path.suffixes
+        remedy = ": export the recording with jointfit export --to trc" if recorded else ""
+        raise MalformedFileError(f"{path}: expected a file that ends in .trc or .c3d{remedy}")
 
     up = cast("Axis", up_axis or declared or custom)
     turned = to_z_up(trajectories.positions, up)

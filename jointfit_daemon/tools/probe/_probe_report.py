@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 from pydantic.dataclasses import dataclass
 
-from jointfit_daemon.name_lists import list_names
 from jointfit_daemon.tools.discovery import (
     CanChannel,
     CanInterface,
@@ -75,8 +74,8 @@ def report_lines(report: ProbeReport) -> Iterator[str]:
             f"{server.protocol}, {server.transport}, at {server.interface}"
         )
         if server.bodies or server.markers:
-            yield f"    rigid bodies: {list_names(server.bodies) or 'none'}"
-            yield f"    markers: {list_names(server.markers) or 'none'}"
+            yield f"    rigid bodies: {', '.join(server.bodies) or 'none'}"
+            yield f"    markers: {', '.join(server.markers) or 'none'}"
 
     if report.rig_toml:
         yield f"\nLines for rig.toml:\n\n{report.rig_toml.rstrip()}"

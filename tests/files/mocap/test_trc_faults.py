@@ -7,7 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from jointfit_daemon.files.mocap import MarkerTrajectories, read_trc, write_trc
+from jointfit_daemon.files.mocap import (
+    MarkerTrajectories,
+    read_marker_trial,
+    read_trc,
+    write_trc,
+)
 from jointfit_daemon.files.text import MalformedFileError
 
 if TYPE_CHECKING:
@@ -39,3 +44,9 @@ def test_each_fault_names_what_was_found(tmp_path: Path, text: str, said: str) -
     with pytest.raises(MalformedFileError) as caught:
         read_trc(tmp_path / "m.trc")
     assert said in str(caught.value)
+
+
+def test_a_recording_is_refused_with_the_command_that_exports_it(tmp_path: Path) -> None:
+    for path in (tmp_path, tmp_path / "demo-20260131T120000-0001.mcap"):
+        with pytest.raises(MalformedFileError, match="jointfit export --to trc"):
+            read_marker_trial(path)
