@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 import struct
 
@@ -17,6 +18,8 @@ ANCILLARY_BYTES = socket.CMSG_SPACE(_STAMP.size)
 class SocketStamps(WallClock):
     """Converts the stamps of one socket. Call `pair` at every wake-up.
 
+    If the system has no such stamps, as an emulator, the time of the read is used.
+
     Parameters
     ----------
     stamped : socket.socket
@@ -25,7 +28,11 @@ class SocketStamps(WallClock):
 
     def __init__(self, stamped: socket.socket) -> None:
         super().__init__()
-        stamped.setsockopt(socket.SOL_SOCKET, _TIMESTAMPNS, 1)
+        try:
+            stamped.setsockopt(socket.SOL_SOCKET, _TIMESTAMPNS, 1)
+        except OSError as error:
+            if error.errno != errno.ENOPROTOOPT:
+                raise
 
     def arrival(self, ancillary: list[tuple[int, int, bytes]], now_ns: int) -> int:
         """Return the monotonic time at which data arrived, ns; `now_ns` if there is no stamp."""

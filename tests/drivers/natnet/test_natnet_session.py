@@ -21,6 +21,7 @@ from jointfit_drivers.ports.udp_socket import UdpSocket, local_address
 from jointfit_protocols.natnet import NatNetMessageId, ServerInfo, encode
 from jointfit_simulators._contract_fixtures import DecodingReceiver
 from jointfit_simulators.devices import NatNetServer, NatNetServerOptions, RigidBodyAsset
+from tests.drivers.ports.socket_options import needs_kernel_stamps
 from tests.simulators.natnet_replay import NatNetReplay
 
 if TYPE_CHECKING:
@@ -112,6 +113,7 @@ async def test_frames_while_the_clock_settles_are_not_dropped() -> None:
     assert heard.decoder.unpublished <= 2  # type: ignore[attr-defined]
 
 
+@needs_kernel_stamps
 async def test_arrival_is_stamped_by_the_kernel_before_the_daemon_wakes() -> None:
     server = serve()
     async with at_work(server) as (heard, _):
@@ -300,6 +302,7 @@ async def test_a_server_that_answers_but_sends_no_frames_is_lost_once(
 # --- stamps -----------------------------------------------------------------------------------
 
 
+@needs_kernel_stamps
 def test_the_kernel_stamps_datagrams_on_loopback() -> None:
     opened = UdpSocket("127.0.0.1", 0, sender="127.0.0.1")
     try:

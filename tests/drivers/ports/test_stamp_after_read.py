@@ -7,8 +7,10 @@ minute; a late one moves nothing.
 from __future__ import annotations
 
 import asyncio
+import errno
 import fcntl
 import os
+import socket
 import termios
 import time
 import tty
@@ -21,6 +23,7 @@ from typing_extensions import override
 
 from jointfit_daemon.driver import CanBusSettings
 from jointfit_drivers.ports._python_can_bus import PythonCanBus
+from jointfit_drivers.ports._socket_stamps import _TIMESTAMPNS
 from jointfit_drivers.ports.serial_port import SerialPort
 from jointfit_drivers.ports.udp_socket import UdpSocket
 
@@ -159,3 +162,26 @@ def test_datagrams_that_the_kernel_does_not_stamp() -> None:
     assert len(arrivals) == 2
     for arrival, came_ns in zip(arrivals, unstamped.came_ns, strict=True):
         assert arrival.t_ns >= came_ns
+
+
+async def test_a_system_without_stamps_of_network_data_uses_the_time_of_the_read(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Unstamped(socket.socket):
+        @override
+        def setsockopt(self, level: int, option: int, *values: Any) -> None:
+            if option == _TIMESTAMPNS:
+                raise OSError(errno.ENOPROTOOPT, os.strerror(errno.ENOPROTOOPT))
+            super().setsockopt(level, option, *values)
+
+    monkeypatch.setattr(socket, "socket", Unstamped)
+    opened = UdpSocket("127.0.0.1", 0, sender="127.0.0.1")
+    try:
+        opened.send(b"x", opened._socket.getsockname())
+        await asyncio.sleep(0.05)
+        before_ns = time.monotonic_ns()
+        (arrival,) = opened.receive()
+    finally:
+        opened.close()
+    assert arrival.data == b"x"
+    assert before_ns <= arrival.t_ns <= time.monotonic_ns()

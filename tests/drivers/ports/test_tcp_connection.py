@@ -9,8 +9,11 @@ import time
 import pytest
 
 from jointfit_drivers.ports.tcp_connection import TcpConnection, TcpListener
+from tests.drivers.ports.socket_options import needs_kernel_stamps
 
 LOOPBACK = "127.0.0.1"
+STAMPS_BEGIN_S = 0.1
+"""Time after which the kernel stamps data, if no other socket had requested stamps, s."""
 
 
 def listening() -> socket.socket:
@@ -25,11 +28,13 @@ async def connected(server: socket.socket) -> tuple[TcpConnection, socket.socket
     return opened, server.accept()[0]
 
 
+@needs_kernel_stamps
 async def test_data_are_stamped_by_their_arrival_and_not_by_the_read() -> None:
     with listening() as server:
         ours, theirs = await connected(server)
         with theirs:
             assert ours.receive() is None
+            await asyncio.sleep(STAMPS_BEGIN_S)
             theirs.sendall(b"pose")
             sent_ns = time.monotonic_ns()
             await asyncio.sleep(0.1)
