@@ -111,9 +111,11 @@ class LimbFuser:
         for i, segment in enumerate(chain.segments):
             stored = calibration.segment[segment]
             self._fusers.append(fuser(segment, chain.sensors[i], stored))
-            length = configured_length(chain, i)  # rig.toml overrides the calibration
-            length = stored.length if length is None else length
-            self._lengths.append(SegmentLength(length, stored.length_sd or 0.0))
+            # rig.toml overrides the calibration; its lengths are exact.
+            configured = configured_length(chain, i)
+            exact = SegmentLength(configured, 0.0)
+            estimated = SegmentLength(stored.length, stored.length_sd or 0.0)
+            self._lengths.append(estimated if configured is None else exact)
         self._neighbors = [neighbor(chain, i) for i in range(len(chain.segments))]
         self._signs = [flexion_sign(joint) for joint in chain.joints]
         self._use_correlations(calibration)

@@ -26,7 +26,7 @@ _FLAGS = {
     "origin_fixed": "The cameras do not see the first joint.",
     "axis_vertical": "% uses the vertical as its axis: the calibration found no joint centre.",
     "axis_from_shoulder": "Axes of % come from the shoulder alone: calibrate with elbow flexion.",
-    "facing_unknown": "The flexion axis of % is unknown; the facing direction is used.",
+    "facing_unknown": "The flexion axis is unknown; the facing direction is used.",
     "uncorrected": "Sensors are used without correction (procedure of the patent).",
     "gimbal": "Gimbal lock: flexion and rotation cannot be separated.",
 }

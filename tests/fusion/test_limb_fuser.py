@@ -17,6 +17,7 @@ from jointfit_daemon.calibration.phases import fit_static
 from jointfit_daemon.calibration.phases._static_pose import fit_static_only
 from jointfit_daemon.fusion import LimbFuser
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
+from jointfit_daemon.limb_model import SegmentCalibration
 from jointfit_daemon.model import Chain, FusionMode, Quaternion, SyncState
 from tests.calibration.synthetic_limb import (
     CHAIN,
@@ -30,12 +31,13 @@ from tests.calibration.synthetic_limb import (
     record,
 )
 from tests.fusion.calibrated_limb import calibrated
+from tests.limb_model.plain_calibration import plain_calibration
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from jointfit_daemon.limb_model import Calibration, Method
-    from jointfit_daemon.model import LimbState
+    from jointfit_daemon.model import JointState, LimbState
 
 STEP = 10_000_000
 ALL_SENSORS = frozenset(OWNER)
@@ -351,3 +353,30 @@ def test_sensors_on_the_plate_are_not_compared(calibration: Calibration, worn: b
     faults = [f for f in flags if f.startswith(("slipped:", "pair_disagrees:", "heading_"))]
     assert bool(faults) == worn
     assert worn or not fuser.pop_reports(1500 * STEP)
+
+
+def test_a_configured_length_is_exact_whatever_the_calibration_estimated() -> None:
+    chain = Chain(
+        joints=("hip", "knee", "ankle"),
+        segments=("thigh", "shank"),
+        sensors=(("S1",), ("S3",)),
+        left_side=False,
+    )
+    calibration = plain_calibration(chain)
+    upright = (1.0, 0.0, 0.0, 0.0)
+    estimated = SegmentCalibration(upright, 0.42, 0.02)
+    calibration = replace(calibration, segment=dict.fromkeys(chain.segments, estimated))
+    worn = dict.fromkeys(("S1", "S3"), upright)
+
+    def ankle(lengths: tuple[float | None, ...]) -> JointState:
+        fuser = LimbFuser(replace(chain, lengths=lengths), calibration)
+        return fuser.fuse(0, 0, 0, worn).joints[2]
+
+    known, unknown = ankle((0.42, 0.42)), ankle((None, None))
+    assert known.position is not None
+    assert known.position[2] == pytest.approx(-0.84)
+    assert known.position_sd is not None
+    assert unknown.position_sd is not None
+    # Independent length errors of 20 mm along z: the root of the mean variance per axis.
+    difference = unknown.position_sd**2 - known.position_sd**2
+    assert difference == pytest.approx(2 * 0.02**2 / 3, rel=0.1)

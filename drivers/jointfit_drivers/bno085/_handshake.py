@@ -186,9 +186,9 @@ async def _explain_silence(
 
     if received or rvc.received:
         raise DeviceMisconfiguredError(
-            f"{settings.port}: {received} bytes at {SHTP_BAUD} baud, none of them an SHTP packet: "
-            "correct `port` or `driver`, which "
-            "`jointfit probe` recognizes"
+            f"{settings.port}: {received} bytes at {SHTP_BAUD} baud without an SHTP packet, and "
+            f"{rvc.received} bytes at {RVC_BAUD} baud without a UART-RVC frame: correct `port` or "
+            "`driver`, which `jointfit probe` recognizes"
         )
     raise DeviceLostError(
         f"{settings.port}: silent: check its power, that PS1 is high and PS0 low (UART-SHTP), and "

@@ -31,7 +31,7 @@ class VectorNavSettings(GatewaySettings, SerialImuSettings):
     direction: Literal["sensor_to_world", "world_to_sensor"] = SettingsField(
         "sensor_to_world",
         description="whether the quaternion maps sensor to world coordinates (as in the manual), "
-        "or the reverse; see the check in docs/devices.md",
+        "or the reverse; see the test of the frames in docs/diagnosis.md",
     )
 
     @property

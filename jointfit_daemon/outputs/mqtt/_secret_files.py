@@ -106,8 +106,8 @@ def security_warnings(settings: MqttSettings) -> list[str]:
         with contextlib.suppress(OSError):
             if path is not None and Path(path).stat().st_mode & _OTHERS:
                 found.append(
-                    f"{name} = {path}: every user of this machine can read it: run chmod o-rw "
-                    f"{path}"
+                    f"{name} = {path}: every user of this machine can read or replace it: run "
+                    f"chmod o-rw {path}"
                 )
     return found
 

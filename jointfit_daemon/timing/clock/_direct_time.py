@@ -95,7 +95,7 @@ class SyncEdgeFit:
     reference : HostTime
         Clock to which the device clock is related.
     grain_ns : float
-        Tick lengths of both clocks, ns, combined as root sum of squares.
+        Tick length of the device clock, ns.
     """
 
     __slots__ = ("_epoch", "_line", "_pairs", "_ref", "_strays", "_variance", "reference")

@@ -51,8 +51,7 @@ const account = (link) => (link.account.username ? `The account ${isolate(link.a
 
 function hiddenSentence(link, topics) {
   const lines = topics.map((topic) => (NEEDED_FOR.has(topic) ? `${topic} (${NEEDED_FOR.get(topic)})` : topic));
-  const poses = topics.includes("pose/ui") ? " Poses are also missing with pose_ui_hz = 0 in rig.toml." : "";
-  return `${account(link)} receives nothing from ${lines.join(", ")} below ${isolate(link.base)}: permit it to read them in the access list of the broker.${poses}`;
+  return `${account(link)} receives nothing from ${lines.join(", ")} below ${isolate(link.base)}: permit it to read them in the access list of the broker.`;
 }
 
 function versionSentence(store, configuration) {
