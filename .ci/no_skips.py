@@ -21,6 +21,7 @@ NOT_INSTALLABLE = (
     "this wire detects damage itself, or does not allow its detection",
     "this wire does not allow detection of a wrong device",
     "bytes of this wire take no time",
+    "the orientation filter begins again",
 )
 """Reasons for which a clean machine may skip tests. They are counted and printed."""
 NOT_IN_MINIMAL = (

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from array import array
 from math import nan
+from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -208,15 +209,7 @@ class SessionCollector:
             Description of the origin of the data.
         """
         begin_ns = self._begin_ns or 0
-        timeline = sorted(self._events, key=lambda item: item[0])
-        if 0 < (count := sum(self._measured_origins)) < len(self._measured_origins):
-            unknown = len(self._measured_origins) - count
-            text = (
-                f"the cameras did not measure the position of the limb in {unknown} of "
-                f"{len(self._measured_origins)} frames, so these positions are unknown"
-            )
-            data = {"unknown": unknown, "frames": len(self._measured_origins)}
-            timeline.insert(0, (begin_ns, TimelineEvent(0.0, "positions", text=text, data=data)))
+        timeline = sorted([*self._position_events(begin_ns), *self._events], key=itemgetter(0))
         segments = {
             name: segment
             for segment, group in zip(rig.chain.segments, rig.chain.sensors, strict=True)
@@ -262,6 +255,19 @@ class SessionCollector:
             ),
             description=description,
         )
+
+    def _position_events(self, begin_ns: int) -> list[tuple[int, TimelineEvent]]:
+        """Return an event with the number of unknown positions if the other ones are known."""
+        frames, measured = len(self._measured_origins), sum(self._measured_origins)
+        if measured in {0, frames}:
+            return []
+        unknown = frames - measured
+        text = (
+            f"the cameras did not measure the position of the limb in {unknown} of {frames} "
+            "frames, so these positions are unknown"
+        )
+        data = {"unknown": unknown, "frames": frames}
+        return [(begin_ns, TimelineEvent(0.0, "positions", text=text, data=data))]
 
 
 def _number(value: float | None) -> float:
