@@ -111,11 +111,9 @@ class LimbFuser:
         for i, segment in enumerate(chain.segments):
             stored = calibration.segment[segment]
             self._fusers.append(fuser(segment, chain.sensors[i], stored))
-            configured = configured_length(chain, i)  # overrides the calibration, and is exact
+            known = configured_length(chain, i)  # overrides the calibration, and is exact
             estimated = SegmentLength(stored.length, stored.length_sd or 0.0)
-            self._lengths.append(
-                estimated if configured is None else SegmentLength(configured, 0.0)
-            )
+            self._lengths.append(estimated if known is None else SegmentLength(known, 0.0))
         self._neighbors = [neighbor(chain, i) for i in range(len(chain.segments))]
         self._signs = [flexion_sign(joint) for joint in chain.joints]
         self._use_correlations(calibration)
