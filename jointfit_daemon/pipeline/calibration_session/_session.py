@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.calibration import PLATE, AlignJob, FunctionalJob, RefitJob, StaticJob
 from jointfit_daemon.calibration.guidance import MovementGuide
+from jointfit_daemon.pipeline.calibration_session._alignment_text import alignment_text
 from jointfit_daemon.pipeline.calibration_session._phase_recording import (
     INSTRUCTIONS,
     STATIC_TIMEOUT_S,
@@ -433,8 +434,8 @@ class CalibrationSession:
         if result.alignment is not None:
             self._change(SessionEvent.ALIGNMENT_FITTED)
             self._alignment = result.alignment
-            quality = {"alignment": quality}
-            status = self.status(t_ns, "worlds aligned", CalibrationPhase.ALIGNED, quality)
+            text, quality = alignment_text(quality), {"alignment": quality}
+            status = self.status(t_ns, text, CalibrationPhase.ALIGNED, quality)
             return [*_notices(t_ns, phase, result.alignment.get("notes", ())), status]
 
         static = phase == CalibrationPhase.STATIC
