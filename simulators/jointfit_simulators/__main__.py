@@ -61,6 +61,9 @@ USAGE = 2
 """Exit code for invalid options, files or ports."""
 ORIGIN_NS = 100_000_000
 """Unit of the start time, ns. The samples of perfect clocks then coincide with the ground truth."""
+_HIDDEN_S = 0.6
+"""Time in which the cameras do not see the markers while the sensors are put on the plate, s. A new
+motion begins at most 0.3 s after its command."""
 _COMMAND_BYTES = 4096
 """Maximum length of a command line, bytes."""
 _PERFECT = "all imperfections zero, except clock offsets, minimum latencies, and those in --set"
@@ -326,8 +329,12 @@ async def _run_scene(scene: Scene, followed: RigOptions | None, limb: str) -> No
         asyncio.get_running_loop().add_signal_handler(number, scene.stop)
 
     def play(name: str) -> None:
-        # Sensors are already on the plate when a person starts the phase.
-        scene.command(f"play {name} at-once" if name == "plate" else f"play {name}")
+        if name == "plate":  # at once, hidden from the cameras: not a part of the phase
+            scene.command("occlude on")
+            scene.command("play plate at-once")
+            asyncio.get_running_loop().call_later(_HIDDEN_S, scene.command, "occlude off")
+        else:
+            scene.command(f"play {name}")
         _print_json({"motion": name})
 
     def report(text: str) -> None:
