@@ -51,7 +51,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return EXIT_USAGE
     if options.check:
-        print(rig_summary(rig))
+        try:
+            print(rig_summary(rig), flush=True)
+        except BrokenPipeError:  # as in `jointfitd --check | head`: discard the rest
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
 
     from jointfit_daemon.outputs.log import PrintableRecord

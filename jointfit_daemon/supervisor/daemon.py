@@ -142,6 +142,7 @@ class Daemon:
         self._loop_errors = DisconnectErrorFilter()
         self._overload = OverloadMonitor()
         self._recorder: Recorder | None = None
+        self._authenticator: RequestAuthenticator | None = None
         self._state_fault: str | None = None
         # None if the folder was writable at the start, because it is then locked already.
         self._state_lock: int | None = None
@@ -168,9 +169,11 @@ class Daemon:
         self._read_request_key(rig)
 
     def _read_request_key(self, rig: Rig) -> None:
-        self._authenticator = RequestAuthenticator(rig.mqtt)
-        if self._authenticator.fault:
-            log.error("mqtt: all requests are refused: %s", self._authenticator.fault)
+        found, before = RequestAuthenticator(rig.mqtt), self._authenticator
+        if before is None or not found.has_key_of(before):
+            self._authenticator = found  # otherwise it knows the nonces that were used
+        if found.fault:
+            log.error("mqtt: all requests are refused: %s", found.fault)
 
     async def _move_to_broker(self, before: Rig, rig: Rig) -> None:
         """Disconnect from the old broker, and send the retained messages to the new broker.

@@ -98,3 +98,13 @@ def test_sigterm_ends_a_daemon_whose_event_loop_hangs(tmp_path: Path, *, full_pi
         with os.fdopen(reading, "rb") as pipe:
             said = pipe.read()
     assert full_pipe or b"the stop did not end within 0.3 s: exiting" in said
+
+
+def test_a_closed_pipe_ends_the_check_without_a_traceback(tmp_path: Path) -> None:
+    rig = Path(__file__).parents[2] / "examples" / "self-described.toml"
+    check = f"{sys.executable} -m jointfit_daemon --config {rig} --check"
+    script = f"{check} | true; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(
+        ["/bin/bash", "-c", script], capture_output=True, text=True, check=False, cwd=tmp_path
+    )
+    assert (done.returncode, done.stderr) == (0, "")

@@ -427,3 +427,27 @@ async def test_the_rate_of_a_rig_without_sensors_has_no_limit_of_sensors(tmp_pat
     async with gateway.run():
         reply = await gateway.ask("rate", {"hz": 50.0})
         assert reply.data == {"before_hz": 100.0, "output_rate_hz": 50.0}
+
+
+async def test_a_request_signed_before_a_reload_is_accepted_unless_the_key_changed(
+    gateway: Running,
+) -> None:
+    key = gateway.folder / "key"
+    key.write_bytes(b"k" * 32)
+    gateway.table["mqtt"]["request_key_file"] = str(key)
+    gateway.write(gateway.table)
+
+    def sign(key: bytes) -> Any:
+        return sign_request(key, f"{BASE}/bridge/request/mark", {"text": "heel strike"})
+
+    async with gateway.run():
+        signed, repeated, other = sign(b"k" * 32), sign(b"k" * 32), sign(b"n" * 32)
+        assert (await gateway.ask("mark", repeated)).status == "ok"
+        await gateway.daemon.reload()
+        assert (await gateway.ask("mark", signed)).status == "ok"
+        assert (await gateway.ask("mark", repeated)).status == "error"
+
+        key.write_bytes(b"n" * 32)
+        await gateway.daemon.reload()
+        assert (await gateway.ask("mark", other)).status == "error"
+        assert (await gateway.ask("mark", sign(b"n" * 32))).status == "ok"

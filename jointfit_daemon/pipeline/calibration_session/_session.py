@@ -222,7 +222,7 @@ class CalibrationSession:
     # --- requests ----------------------------------------------------------------------------
 
     def request(self, request: Request) -> list[Output]:
-        """Start or abort a phase, or revert online learning. The first output is the reply."""
+        """Start or abort a phase, or revert online learning; the outputs contain the reply."""
         wanted = str(request.arguments.get("phase", ""))
         if request.command == "static":
             wanted = "static"

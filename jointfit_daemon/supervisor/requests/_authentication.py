@@ -55,6 +55,10 @@ class RequestAuthenticator:
         self._since_us = time.time_ns() // 1000
         self._used: OrderedDict[str, int] = OrderedDict()
 
+    def has_key_of(self, other: RequestAuthenticator) -> bool:
+        """Return whether both objects verify with the same key, or neither has a key."""
+        return (self._key, self.fault) == (other._key, other.fault)
+
     def check(self, topic: str, request: Mapping[str, Any]) -> dict[str, Any]:
         """Check the signature of `request`; return the request without the signature's keys.
 

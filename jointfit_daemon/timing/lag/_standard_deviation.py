@@ -14,9 +14,8 @@ blocks.
 A variance from few blocks is uncertain itself. :math:`\nu + 1 = (\sum h)^2/\sum h^2` is the
 effective number of blocks that carry the information h about the lag. The finest scale is widened
 by the ratio of the Student t quantile with :math:`\nu` degrees of freedom to the normal quantile of
-equal probability. Coarser scales only detect long correlations; they are widened by
-:math:`\nu/(\nu-2)`, the variance of t. If the window contains a single tap and otherwise rest, the
-result is infinite.
+equal probability. Coarser scales only detect long correlations, and are not widened. If the window
+contains a single tap and otherwise rest, the result is infinite.
 
 If all samples with information about the lag have the same timestamp error, the residuals do not
 show this error. Devices sample on ticks of an internal clock. The rounding error of the timestamps
