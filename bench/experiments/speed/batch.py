@@ -51,9 +51,11 @@ def batch_results(quick: bool) -> list[Result]:
 
         before_mb, after_mb = _memory(_copies(folder / "short", many), folder / "many", warm)
     note = f"{count} recordings of {SAMPLES / 100:.0f} s: replay, export, report; {rounds} rounds"
+    # The start of the two processes takes as long as a recording or longer.
+    least = 1.2 if quick else 1.8
     return [
         Result(
-            "two processes against one", round(statistics.median(speedups), 2), minimum=1.8,
+            "two processes against one", round(statistics.median(speedups), 2), minimum=least,
             unit="×", note=note,
         ),
         timed_result("one recording, one process", round(min(seconds[1]) / count, 2), "s"),
