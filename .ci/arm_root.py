@@ -57,6 +57,7 @@ NOT_IN_EMULATION = (
     "tests/drivers/natnet/test_natnet_session.py",
     "tests/drivers/natnet/test_natnet_hostile.py::test_a_model_of_one_datagram",
     "tests/drivers/ports/test_python_can_bus.py::test_link_down_is_reported_once",
+    "tests/calibration/phases/test_functional_fit.py::test_correction_has_smaller_errors",
 )
 """Tests that need socket options or CAN errors that QEMU's user emulation lacks, such as
 IP_MULTICAST_IF and SO_MEMINFO, or that limit the processor time. Beginnings of their names."""
