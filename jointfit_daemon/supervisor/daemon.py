@@ -147,8 +147,7 @@ class Daemon:
         # None if the folder was writable at the start, because it is then locked already.
         self._state_lock: int | None = None
         self._calibration: CalibrationStatus | None = None
-        self._health_due_s = 0.0
-        self._reload_requested = asyncio.Event()
+        self._health_due_s, self._reload_requested = 0.0, asyncio.Event()
         self._changes = asyncio.Lock()
         """Lock that permits one change of the configuration or of a source at a time."""
         self._tasks: asyncio.TaskGroup
@@ -169,11 +168,9 @@ class Daemon:
         self._read_request_key(rig)
 
     def _read_request_key(self, rig: Rig) -> None:
-        found, before = RequestAuthenticator(rig.mqtt), self._authenticator
-        if before is None or not found.has_key_of(before):
-            self._authenticator = found  # otherwise it knows the nonces that were used
-        if found.fault:
-            log.error("mqtt: all requests are refused: %s", found.fault)
+        self._authenticator = RequestAuthenticator(rig.mqtt).continuing(self._authenticator)
+        if self._authenticator.fault:
+            log.error("mqtt: all requests are refused: %s", self._authenticator.fault)
 
     async def _move_to_broker(self, before: Rig, rig: Rig) -> None:
         """Disconnect from the old broker, and send the retained messages to the new broker.

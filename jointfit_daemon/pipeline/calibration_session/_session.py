@@ -439,8 +439,7 @@ class CalibrationSession:
             return [*_notices(t_ns, phase, result.alignment.get("notes", ())), status]
 
         static = phase == CalibrationPhase.STATIC
-        if static:
-            quality = {"static": quality}
+        quality = {"static": quality} if static else quality
         if result.calibration is None:
             self._change(SessionEvent.POSE_FITTED)
             return [self.status(t_ns, "static pose recorded", CalibrationPhase.POSED, quality)]

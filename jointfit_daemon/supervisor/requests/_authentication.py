@@ -55,9 +55,11 @@ class RequestAuthenticator:
         self._since_us = time.time_ns() // 1000
         self._used: OrderedDict[str, int] = OrderedDict()
 
-    def has_key_of(self, other: RequestAuthenticator) -> bool:
-        """Return whether both objects verify with the same key, or neither has a key."""
-        return (self._key, self.fault) == (other._key, other.fault)
+    def continuing(self, before: RequestAuthenticator | None) -> RequestAuthenticator:
+        """Return `before`, which knows the used nonces, if its key is the same; otherwise this."""
+        if before is not None and (self._key, self.fault) == (before._key, before.fault):
+            return before
+        return self
 
     def check(self, topic: str, request: Mapping[str, Any]) -> dict[str, Any]:
         """Check the signature of `request`; return the request without the signature's keys.
