@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections import OrderedDict
+from hashlib import sha256
 from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.outputs.mqtt import (
@@ -52,12 +53,14 @@ class RequestAuthenticator:
             self._key = request_key_of(settings)
         except RequestKeyError as missing:
             self.fault = str(missing)
+        self.fingerprint = (sha256(self._key or b"").hexdigest(), self.fault)
+        """Digest of the key, and the fault."""
         self._since_us = time.time_ns() // 1000
         self._used: OrderedDict[str, int] = OrderedDict()
 
     def continuing(self, before: RequestAuthenticator | None) -> RequestAuthenticator:
         """Return `before`, which knows the used nonces, if its key is the same; otherwise this."""
-        if before is not None and (self._key, self.fault) == (before._key, before.fault):
+        if before is not None and self.fingerprint == before.fingerprint:
             return before
         return self
 
