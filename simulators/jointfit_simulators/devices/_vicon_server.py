@@ -158,7 +158,8 @@ class ViconServer:
         Parameters
         ----------
         exposure_host_ns : int
-            Exposure time, host CLOCK_MONOTONIC, ns. It is independent of the time of sending.
+            Instant of the exposure, host CLOCK_MONOTONIC, ns. It is independent of the time of
+            sending.
         markers : mapping of str to (x, y, z) or None
             Position in the world (z up), m; None if occluded. Markers without a body are not sent.
         bodies : mapping of str to (position, quaternion) or None
