@@ -68,6 +68,15 @@ def test_a_file_is_converted_and_the_files_are_printed(trial: Path, tmp_path: Pa
     assert np.isfinite(second.orientation[second.t_s > 3.525]).all()
 
 
+def test_several_formats_are_written_by_one_command(trial: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    words = ["--to", "sto", "--to", "mot", "--to", "sto", "--out", str(out)]
+    result = run(app, ["export", str(trial), *words])
+    assert result.exit_code == 0, result.output
+    assert {path.suffix for path in out.iterdir()} == {".sto", ".mot"}
+    assert sorted(result.stdout.splitlines()) == sorted(map(str, out.iterdir()))
+
+
 def test_sensors_are_renamed_for_opensense(trial: Path, tmp_path: Path) -> None:
     words = ["export", str(trial), "--to", "sto", "--out", str(tmp_path), "--json"]
     result = run(app, [*words, "--name", "S1=femur_r_imu"])
