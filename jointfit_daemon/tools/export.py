@@ -88,9 +88,12 @@ def load_data(file: Path) -> SessionData:
 
     Raises
     ------
+    OSError
+        The file does not exist, or cannot be read.
     ValueError
         The file is damaged, or its type is unknown.
     """
+    file.stat()  # a wrong path is reported as such, not as a wrong type
     recorded = any(file.glob("*.mcap*")) if file.is_dir() else ".mcap" in file.suffixes
     if recorded:
         from jointfit_daemon.reprocessing import load_session

@@ -68,6 +68,12 @@ def test_a_file_is_converted_and_the_files_are_printed(trial: Path, tmp_path: Pa
     assert np.isfinite(second.orientation[second.t_s > 3.525]).all()
 
 
+def test_a_wrong_path_is_not_reported_as_a_wrong_type(tmp_path: Path) -> None:
+    result = run(app, ["export", str(tmp_path / "no-recording"), "--to", "csv"])
+    assert result.exit_code == 2
+    assert "No such file or directory" in result.output
+
+
 def test_several_formats_are_written_by_one_command(trial: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     words = ["--to", "sto", "--to", "mot", "--to", "sto", "--out", str(out)]
