@@ -1,10 +1,10 @@
 """Delay of the messages of one device, relative to its fastest messages.
 
-After a silence, buffered messages arrive together. All these messages are late. The first message
-has the largest delay, and the last has the smallest. Device time and arrival time then advance
-differently although the device continued. Between two messages, e is the elapsed arrival time and d
-is the advance of device time. The delay L' of the second message follows from the delay L of the
-first:
+After a silence, buffered messages (a *backlog*) arrive together. All these messages are late. The
+first message has the largest delay, and the last has the smallest. Device time and arrival time
+then advance differently although the device continued to run. Between two messages, e is the
+elapsed arrival time and d is the advance of device time. The delay L' of the second message follows
+from the delay L of the first:
 
     L' = max(0, L + (1 - m) e - d),   m = 0.1 %.
 
@@ -17,10 +17,10 @@ Invariant: the result depends only on the steps fed, in any unit of time. The mo
 from __future__ import annotations
 
 _SKEW = 0.001
-"""Margin m, relative. It is twice the largest plausible skew of a device clock."""
+"""Margin m, as a ratio. It is twice the largest plausible skew of a device clock."""
 _BURST_SHARE = 0.5
-"""Share of the advance of device time. A message is part of a burst if it arrives earlier than the
-shortest delay permits, by more than this share."""
+"""Share of the advance d of device time. A message is part of a burst if L + (1 - m) e - d is below
+zero by more than this share of d. Then the messages arrive faster than the device measures."""
 
 
 class BacklogDelay:
@@ -30,7 +30,7 @@ class BacklogDelay:
 
     def __init__(self) -> None:
         self._delay = 0.0
-        self._paced = 0.0  # time since the last message of a burst
+        self._paced = 0.0  # elapsed arrival time since the last message of a burst
 
     def feed(self, advance: float, elapsed: float) -> None:
         """Add a message of a device that continued to run.
@@ -53,18 +53,19 @@ class BacklogDelay:
         Parameters
         ----------
         settle
-            Time with messages at the device's own rate after which the delay is known.
+            Time with messages at the device's own rate after which the delay is known, in the unit
+            of `feed`.
         unknown
-            Smallest limit that is returned until the delay is known.
+            Smallest value that is returned until the delay is known, in the unit of `feed`.
         """
         return self._delay if self._paced >= settle else max(self._delay, unknown)
 
 
 def device_continued(delay: float, advance: float, elapsed: float, tolerance: float) -> bool:
-    """Return whether a backlog and the arrival times explain a step of device time.
+    """Return whether the arrival times and a backlog explain a step of device time.
 
-    Device time may advance by more than the elapsed arrival time, but only by the delay of the
-    previous message, because no message arrives before it is sent.
+    Device time may advance by more than the elapsed arrival time. The difference is at most the
+    delay of the previous message, because no message arrives before it is sent.
 
     Parameters
     ----------
@@ -75,6 +76,6 @@ def device_continued(delay: float, advance: float, elapsed: float, tolerance: fl
     elapsed
         Time between the arrivals of the two messages.
     tolerance
-        Largest error of the comparison. All four arguments have the same unit.
+        Largest difference that needs no explanation. All four arguments have the same unit.
     """
     return -tolerance <= advance - elapsed <= delay + tolerance

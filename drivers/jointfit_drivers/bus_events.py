@@ -22,13 +22,13 @@ class BusEvents:
 
     def __init__(self) -> None:
         self.discarded_bytes = 0
-        """Number of bytes in rejected records, plus the bytes on an adapter's line that formed no
+        """Number of bytes in rejected records, plus the bytes from a serial adapter that formed no
         frame."""
         self._text = ""
         self._reported_ns = 0
 
     def discard(self, count: int, reason: str, rejected: int = 0) -> Corrupt:
-        """Count `count` corrupt bytes with `rejected` messages, and return them as an event."""
+        """Count `count` corrupt bytes of `rejected` messages, and return them as one `Corrupt`."""
         self.discarded_bytes += count
         return Corrupt(count, reason, rejected)
 
@@ -45,7 +45,7 @@ class BusEvents:
         return self.limit_event("error" if serious else "warning", text, frame.t_ns)
 
     def limit_event(self, kind: DeviceEventKind, text: str, t_ns: int) -> list[Decoded]:
-        """Return an event, unless the same event was reported within a second before `t_ns`."""
+        """Return the event in a list, or an empty list if it repeats the last event within 1 s."""
         if text == self._text and 0 <= t_ns - self._reported_ns < _REPEAT_NS:
             return []
         self._text, self._reported_ns = text, t_ns

@@ -1,7 +1,7 @@
 """Base class of decoders for IMUs on a CAN bus: conversion of records to frames, and bus errors.
 
-A chunk of a CAN bus contains records of 24 bytes. A record is a frame of the device, an error frame
-of the controller, or a note of this host about lost frames and bytes.
+A chunk of a CAN bus contains records of 24 bytes. A record contains a CAN frame, an error frame of
+the controller, or the number of frames or bytes that this host lost.
 
 Invariant: the output depends only on the chunks fed. The decoder reads no clock and no bus.
 """
@@ -28,9 +28,9 @@ class CanDecoder(ABC):
     Parameters
     ----------
     ids : collection of CanKey
-        Identifiers of the device: number, and whether it has 29 bits. Other frames are ignored.
+        Identifiers of the device, each with a flag for 29 bits. Other frames are ignored.
     samples : CheckedSamples
-        Checks that `convert` applies to its samples.
+        Object that checks each sample. `convert` passes its samples to this object.
     """
 
     def __init__(self, ids: Collection[CanKey], samples: CheckedSamples) -> None:
@@ -43,8 +43,8 @@ class CanDecoder(ABC):
     def convert(self, frame: can.CanFrame) -> Iterable[Decoded]:
         """Return the samples and events that a frame of the device completes.
 
-        `frame.t_ns` is the arrival of the frame. If a frame cannot be used, call
-        ``self.samples.refuse(RECORD_BYTES, reason)``, which counts it.
+        `frame.t_ns` is the arrival of the frame. For a frame that cannot be used, a subclass calls
+        ``self.samples.refuse(RECORD_BYTES, reason)``, which counts the frame.
         """
 
     @property
@@ -59,7 +59,7 @@ class CanDecoder(ABC):
 
     @property
     def discarded_bytes(self) -> int:
-        """Number of bytes in rejected records, and on an adapter's line that formed no frame."""
+        """Number of bytes in rejected records, plus adapter bytes that formed no frame."""
         return self._bus.discarded_bytes + self.samples.refused_bytes
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
@@ -76,5 +76,5 @@ class CanDecoder(ABC):
         return out
 
     def flush(self) -> list[Decoded]:
-        """Reject a sample that waits for confirmation."""
+        """Reject the sample that waits for confirmation, if there is one, and return the events."""
         return self.samples.flush()

@@ -1,4 +1,4 @@
-"""Reception of the frames of one device on a CAN bus, across all attempts of its driver."""
+"""Reception of the frames of one device on a CAN bus, across all connection attempts."""
 
 from __future__ import annotations
 
@@ -19,11 +19,10 @@ log = logging.getLogger(__name__)
 
 _LONGEST_SILENCE_S = 30.0
 """Longest wait for the first frame of a lost device, s. The wait doubles with every attempt. During
-the wait the device stays subscribed, so its first frame is received at once. After the first frame
-`silence_s` applies."""
+the wait the driver stays subscribed to the device's frames, so it receives the first frame at once.
+After the first frame, the longest wait for a frame is `silence_s`."""
 _RAW_FRAMES = 20
-"""Number of frames that are logged at debug level, so that the log contains raw data of a
-device."""
+"""Number of frames of each attempt that are logged at debug level, as raw data of the device."""
 
 
 class CanDeviceSettings(Protocol):
@@ -57,7 +56,7 @@ class CanReception:
         self._settings = settings
         self._configured_by = configured_by
         self._worked = False
-        self._first_s = settings.silence_s  # wait for the first frame; reopening costs more
+        self._first_s = settings.silence_s  # longest wait for the first frame, s
 
     async def run(
         self,
@@ -66,7 +65,7 @@ class CanReception:
         needed: CanKey,
         resembles: Callable[[bytes], bool] = lambda _: False,
     ) -> None:
-        """Emit the frames that have one of `ids` until cancelled; see `SharedBus.pump`.
+        """Until cancelled, emit the frames whose identifier is in `ids`; see `SharedBus.pump`.
 
         Parameters
         ----------

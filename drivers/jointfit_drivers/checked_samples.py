@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 _INTERVALS = 20
-"""Number of intervals whose median is the period, so that lost messages do not change it."""
+"""Number of intervals whose median is the measured period. Lost messages hardly change a median."""
 _WRONG_RATE = 0.1
 """Largest relative deviation from the configured rate that causes no warning."""
 
@@ -42,12 +42,13 @@ class CheckedSamples(Refusals):
     rate_hz : float
         Configured sample rate, Hz.
     tick_clock : TickClock, optional
-        Unit and modulus of the device time; None if the device sends none.
+        Unit and modulus of the device time; None if the device sends no time.
     counts : int, optional
-        Number of values of the message counter, for example 256 for one byte; None if it never
-        wraps.
+        Number of values of the message counter, for example 256 for one byte; None if the
+        counter never wraps.
     tolerance : float
-        Largest deviation of the quaternion norm from 1. Use 0.05 for integers in thousandths.
+        Largest deviation of the quaternion norm from 1. Use 0.05 for components that
+        are integers in thousandths.
     """
 
     def __init__(
@@ -74,7 +75,7 @@ class CheckedSamples(Refusals):
         Parameters
         ----------
         sample
-            Next sample. `q_world_sensor` has the canonical direction and axes, but any norm and
+            Next sample. Its `q_world_sensor` follows CONVENTIONS.md, but may have any norm and
             sign.
         size
             Number of bytes of the sample's message on the wire.
@@ -95,7 +96,7 @@ class CheckedSamples(Refusals):
             out += self._admit(*held)
             lost = step.lost_since
         else:
-            out = self.flush()  # the next sample contradicts the held one
+            out = self.flush()  # this sample contradicts the held sample
             lost = step.lost
 
         # A single sample cannot prove a restart, because some corrupt messages pass a checksum.
@@ -108,14 +109,14 @@ class CheckedSamples(Refusals):
 
     @override
     def flush(self) -> list[Decoded]:
-        """Reject a sample that no later sample confirmed."""
+        """Reject the held sample, which no later sample confirmed, and return the events."""
         held, self._held = self._held, None
         if held is None:
             return []
         return [self.refuse(held.size, "time and counter disagree with the other samples")]
 
     def _admit(self, sample: ImuSample, size: int) -> list[Decoded]:
-        """Return the sample with a unit quaternion, or the reason why the sample is rejected."""
+        """Return the sample with a unit quaternion, or the reason for rejecting the sample."""
         q = self._gate.admit(sample.q_world_sensor)
         if q is not None:
             checked = sample._replace(q_world_sensor=q)
@@ -139,7 +140,7 @@ class CheckedSamples(Refusals):
         if last is None:
             return []
         passed = ticks - last if self._modulus is None else (ticks - last) % self._modulus
-        if passed > 0:  # device time begins again after a restart
+        if passed > 0:  # not positive: the device restarted
             self._intervals.append(passed)
         if len(self._intervals) < _INTERVALS:
             return []
@@ -148,7 +149,7 @@ class CheckedSamples(Refusals):
         if abs(found_hz - self._rate_hz) <= _WRONG_RATE * self._rate_hz:
             return []
         text = (
-            f"{found_hz:.4g} samples per second by the time of the device, expected "
-            f"{self._rate_hz:g}: set rate_hz = {found_hz:.4g}, or the rate of the device"
+            f"the device time shows {found_hz:.4g} samples per second, expected "
+            f"{self._rate_hz:g}: set rate_hz = {found_hz:.4g}, or change the rate of the device"
         )
         return [DeviceEvent("warning", text, {"rate_hz": round(found_hz, 2)})]

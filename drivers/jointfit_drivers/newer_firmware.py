@@ -1,8 +1,8 @@
-"""Detection of devices that are newer than the descriptions on which their codec is based.
+"""Detection of devices that are newer than the protocol descriptions that their codec follows.
 
-Two signs indicate newer firmware: the version that the device reports, and well-formed contents of
-unknown kind or length. Both signs only cause warnings. Contents that the codec can decode are still
-used.
+Two signs indicate newer firmware: the version that the device reports, and well-formed message
+contents of unknown kind or length. Both signs only cause warnings. Contents that the codec can
+decode are still used.
 
 Invariant: the output depends only on the calls. The module reads no clock and no port.
 """
@@ -22,7 +22,7 @@ _SIGHTINGS = 10
 """Number of unknown contents of one kind that causes a warning. A smaller number proves nothing,
 because a weak checksum accepts some corrupt messages."""
 _WITHIN_NS = 60_000_000_000
-"""Longest time between the first and the last of these contents for a warning, ns."""
+"""Longest time between the first and the last of these `_SIGHTINGS` contents, ns."""
 _MOST_KINDS = 16
 """Largest number of kinds of unknown contents that are counted and reported."""
 _NUMBER = re.compile(r"\d{1,9}")
@@ -30,31 +30,31 @@ _NUMBER = re.compile(r"\d{1,9}")
 
 @dataclass(frozen=True, slots=True)
 class NewestKnown:
-    """Newest version that the codec of a family supports, and the program that installs it."""
+    """Newest version that the codec of a device family supports, and the vendor's program."""
 
     version: tuple[int, ...]
-    """Leading numbers of the version. The vendor changes the other numbers without changing
-    contents."""
+    """Leading numbers of the version. If only the other numbers change, the message
+    contents stay the same."""
     tool: str
-    """Program of the vendor that selects outputs and installs firmware."""
+    """Vendor's program that selects outputs and installs firmware."""
     part: str = "firmware"
-    """Name of the versioned part: firmware, or a protocol."""
+    """Name of the part that has this version: ``firmware``, or a protocol."""
 
     @property
     def text(self) -> str:
-        """Version as text, with ``x`` in place of numbers that do not matter."""
+        """Version as text. If it has one number, ``.x`` stands for the other numbers."""
         return ".".join(map(str, self.version)) + (".x" if len(self.version) == 1 else "")
 
 
 class NewerFirmwareDetector:
-    """Warns that one device is newer than the supported versions.
+    """Warns if one device is newer than the supported version.
 
     Parameters
     ----------
     newest : NewestKnown, optional
         Newest supported version; None if devices of the family report no comparable version.
     tool : str
-        Program that selects the outputs, for devices for which `newest` is None.
+        Program that selects the outputs; only used if `newest` is None.
     sightings : int
         Number of unknown contents of one kind that causes a warning. Use 1 for a connection without
         transmission errors.
@@ -69,7 +69,7 @@ class NewerFirmwareDetector:
         self._sightings = sightings
         self._found = ""
         self._reported = ""
-        self._seen: dict[str, tuple[int, int]] = {}  # count, and time of the first one
+        self._seen: dict[str, tuple[int, int]] = {}  # count, and arrival of the first, ns
 
     @property
     def is_settled(self) -> bool:
@@ -87,19 +87,19 @@ class NewerFirmwareDetector:
             return []
         self._reported = found
         text = (
-            f"{newest.part} {found} is newer than {newest.text}, the newest known here; known "
+            f"{newest.part} {found} is newer than {newest.text}, the newest known version; known "
             f"contents are used: update jointfitd, or return to {newest.part} {newest.text} with "
             f"{newest.tool}; then compare the angles with `jointfit probe --physical-test`"
         )
         return [DeviceEvent("warning", text, self._data())]
 
     def take_unknown(self, content: str, t_ns: int) -> list[Decoded]:
-        """Return a warning, once, if contents of an unknown kind are repeated.
+        """Return a warning, once per kind, if contents of an unknown kind arrive repeatedly.
 
         Parameters
         ----------
         content
-            Name of the content with number or size, such as ``message 0x77``.
+            Name of the kind of content, with its number or size, such as ``message 0x77``.
         t_ns
             Arrival time of the content, monotonic ns.
         """
@@ -114,7 +114,7 @@ class NewerFirmwareDetector:
         found = self._found or "not reported"
         newest = "" if self._newest is None else f", newest known {self._newest.text}"
         text = (
-            f"the device sends {content}, which this version does not know ({self._part} {found}"
+            f"the device sends {content}, which jointfitd does not know ({self._part} {found}"
             f"{newest}); it is ignored, known contents are used: update jointfitd, or disable this "
             f"output with {self._tool}"
         )

@@ -18,11 +18,11 @@ class Refusals:
         """Number of messages that yielded no sample, and the number of their bytes."""
 
     def refuse(self, size: int, reason: str) -> Corrupt:
-        """Count a message of `size` bytes that yields no sample."""
+        """Count a message of `size` bytes that yields no sample, and return it as `Corrupt`."""
         self.refused += 1
         self.refused_bytes += size
         return Corrupt(size, reason, rejected=1)
 
     def flush(self) -> list[Decoded]:
-        """Reject a sample that waits for confirmation; only subclasses have such samples."""
+        """Reject a sample that waits for confirmation. Only subclasses have such samples."""
         return []

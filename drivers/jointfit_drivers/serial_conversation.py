@@ -24,8 +24,8 @@ log = logging.getLogger(__name__)
 _QUIET_S = 0.1
 """Pause after which the rest of a message with a corrupt length is no longer expected, s."""
 _KEPT = 8192
-"""Number of bytes stored before the first reply. This number exceeds the size of one message and of
-the data that follow it."""
+"""Number of bytes stored before the first reply. This number exceeds the size of one message plus
+the data that arrive together with it."""
 _LOGGED = 20
 """Number of chunks logged at debug level, so that the log contains raw data of a new device."""
 
@@ -53,13 +53,13 @@ class StreamCodec(Protocol[Found_co]):
 
     @property
     def pending(self) -> int:
-        """Number of bytes of the incomplete message in the buffer."""
+        """Number of buffered bytes, which belong to an incomplete message."""
 
     def feed(self, data: bytes) -> Sequence[Found_co | CorruptBytes]:
-        """Return the messages that `data` completes."""
+        """Return the messages and runs of corrupt bytes that `data` completes."""
 
     def flush(self) -> Sequence[Found_co | CorruptBytes]:
-        """Return messages that the pending bytes of an incomplete message contain."""
+        """Discard the incomplete message; return other messages that the pending bytes contain."""
 
 
 class SerialConversation(Generic[Message]):
@@ -85,12 +85,12 @@ class SerialConversation(Generic[Message]):
         self._t_ns = 0  # arrival of the last chunk
         self._logged = 0
         self.received = 0
-        """Number of bytes received so far."""
+        """Number of bytes received since the last reset."""
         self.understood = 0
-        """Number of messages received so far."""
+        """Number of messages received since the last reset."""
 
     def reset(self) -> None:
-        """Discard received bytes, here and in the port, for another speed or a new start."""
+        """Discard received bytes, here and in the port, before a change of speed or a new start."""
         self._port.flush_input()
         self._codec, self._recent = self._make_codec(), b""
         self.received = self.understood = 0
@@ -102,7 +102,10 @@ class SerialConversation(Generic[Message]):
     async def ask(
         self, request: bytes, is_reply: Callable[[Message], bool], *, tries: int, wait_s: float
     ) -> Message | None:
-        """Send a request until its reply arrives; return None if no reply arrives."""
+        """Send a request, and repeat it up to `tries` times in all; return its reply.
+
+        Each time, wait at most `wait_s` seconds. Return None if no reply arrives.
+        """
         for _ in range(tries):
             await self.send(request)
             reply = await self.receive(is_reply, wait_s)

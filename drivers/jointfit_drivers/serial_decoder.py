@@ -1,4 +1,4 @@
-"""Base classes of decoders for IMUs on a serial line; subclasses convert single messages.
+"""Base classes of decoders for IMUs on a serial line. Subclasses convert single messages.
 
 Invariant: the output depends only on the chunks fed. The decoder reads no clock and no port.
 """
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class CountingCodec(StreamCodec[Found_co], Protocol[Found_co]):
-    """Codec that counts discarded bytes, such as a `ResynchronizingCodec`."""
+    """Codec that counts messages and discarded bytes, such as a `ResynchronizingCodec`."""
 
     messages: int
 
@@ -34,7 +34,7 @@ class CountingCodec(StreamCodec[Found_co], Protocol[Found_co]):
 
 
 class SerialMessageDecoder(ABC, Generic[Message]):
-    """Decoder of one device. A subclass converts each message and computes its stamp if necessary.
+    """Decoder of one device. A subclass converts each message; `_arrival_of` returns its stamp.
 
     After a silence, the decoder discards an incomplete message.
 
@@ -67,12 +67,12 @@ class SerialMessageDecoder(ABC, Generic[Message]):
         """Return the samples and events of one message."""
 
     def _take_corrupt(self, found: CorruptBytes) -> list[Decoded]:
-        """Return an event for corrupt bytes; a subclass may add findings."""
+        """Return the event of corrupt bytes; a subclass may return further events."""
         return [Corrupt(found.discarded, found.reason)]
 
     @property
     def messages(self) -> int:
-        """Number of well-formed messages so far."""
+        """Number of messages so far, without rejected messages."""
         return self._codec.messages - self._refusals.refused
 
     @property
@@ -95,7 +95,10 @@ class SerialMessageDecoder(ABC, Generic[Message]):
         return out
 
     def flush(self) -> list[Decoded]:
-        """Discard an incomplete message, and a sample that waits for confirmation."""
+        """Discard an incomplete message and a sample that waits for confirmation.
+
+        Return the samples and events that result.
+        """
         out: list[Decoded] = []
         self._append(self._codec.flush(), out)
         return out + self._refusals.flush()
@@ -113,17 +116,17 @@ class SerialMessageDecoder(ABC, Generic[Message]):
 
 
 class SerialDecoder(SerialMessageDecoder[Message]):
-    """Decoder of one device whose samples pass `CheckedSamples`; a subclass converts messages.
+    """Decoder of one device whose samples `CheckedSamples` checks; a subclass converts messages.
 
-    The stamp of a sample is the arrival of its first byte. After a silence, the decoder discards an
-    incomplete message.
+    The stamp of a sample is the arrival of the first byte of its message. After a silence, the
+    decoder discards an incomplete message.
 
     Parameters
     ----------
     codec, baud, longest
         As described at `SerialMessageDecoder`.
     samples : CheckedSamples
-        Checks that `convert` applies to its samples.
+        Object that checks each sample. `convert` passes its samples to this object.
     """
 
     def __init__(

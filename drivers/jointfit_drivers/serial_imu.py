@@ -23,16 +23,16 @@ _BITS = 10
 _SILENCE_FLOOR_NS = 250_000_000
 """Smallest silence after which an incomplete message is discarded, ns.
 
-At high speed, the duration of 1.5 messages is so short that a delayed read by the host would look
-like silence.
+At high line speed, the duration of 1.5 messages is so short that a delayed read by the host would
+look like silence.
 """
 _PERIODS_OF_SILENCE = 3
-"""Smallest number of sample periods without data after which a device counts as silent. A slow
-device may send nothing for two periods."""
+"""Smallest number of sample periods without data after which a device counts as lost. A device may
+send nothing for two periods."""
 _RATE_TOLERANCE = 1e-3
-"""Largest relative difference between a requested rate and the rate of a device."""
+"""Largest relative difference between the configured rate and a rate that the device offers."""
 _RATES_SHOWN = 12
-"""Largest number of rates in one message."""
+"""Largest number of rates in one error message."""
 
 
 class SerialImuSettings(ImuSettings):
@@ -62,7 +62,7 @@ class SerialImuSettings(ImuSettings):
     def require_line_speed(self, speed: str = "the speed of the device") -> None:
         """Raise DeviceMisconfiguredError if the data need more bits per second than `baud`.
 
-        `speed` is the name of the device setting that corresponds to `baud`.
+        In the error message, `speed` is the name of the device setting that corresponds to `baud`.
         """
         needs = self.serial_bits_per_s
         if needs is not None and needs > self.baud:
@@ -72,27 +72,30 @@ class SerialImuSettings(ImuSettings):
             )
 
     def rate_divisor(self, base_hz: int, model: str) -> int:
-        """Return the divisor with which the device sends at `rate_hz`.
+        """Return the integer by which the device divides `base_hz` to send at `rate_hz`.
+
+        In the error message, `model` is the name of the device.
 
         Raises
         ------
         DeviceMisconfiguredError
-            `rate_hz` is not an integer fraction of `base_hz`.
+            `base_hz / rate_hz` is not an integer.
         """
         divisor = round(base_hz / self.rate_hz)
         if divisor < 1 or abs(base_hz / divisor - self.rate_hz) > _RATE_TOLERANCE * self.rate_hz:
             rates = [base_hz / k for k in range(1, base_hz + 1) if base_hz % k == 0]
             shown = ", ".join(f"{rate:g}" for rate in rates[:_RATES_SHOWN])
             raise DeviceMisconfiguredError(
-                f"{self.port}: {self.rate_hz:g} Hz is no whole fraction of the {base_hz} Hz of "
-                f"{model}: set rate_hz to one of {shown}"
+                f"{self.port}: {self.rate_hz:g} Hz is not the {base_hz} Hz of {model} "
+                f"divided by an integer: set rate_hz to one of {shown}"
             )
         return divisor
 
     def stopped_answering(self) -> DeviceLostError:
         """Return the error for a device that stopped answering during its configuration."""
         return DeviceLostError(
-            f"{self.port}: stopped answering during configuration: check its power and cable"
+            f"{self.port}: the device stopped answering during configuration: check its power and "
+            "cable"
         )
 
     @field_validator("port")
@@ -125,7 +128,10 @@ class ArrivalStamps:
         self._stamp_ns = 0
 
     def is_silent_before(self, t_ns: int, size: int) -> bool:
-        """Return whether no bytes arrived for so long that the rest of a message was lost."""
+        """Return whether the silence before a chunk shows that the rest of a message was lost.
+
+        `t_ns` is the arrival of the chunk, and `size` is its number of bytes.
+        """
         return t_ns - self.chunk_ns - size * self._byte_ns > self._silence_ns
 
     def start_chunk(self, t_ns: int) -> None:
@@ -135,8 +141,8 @@ class ArrivalStamps:
     def stamp(self, bytes_since: int) -> int:
         """Return the arrival of a byte `bytes_since` bytes before the chunk's end, monotonic ns.
 
-        USB devices and pseudoterminals are faster than the configured speed, so stamps are limited
-        to never decrease.
+        A stamp is never earlier than the last stamp. Otherwise USB devices and pseudoterminals,
+        which are faster than `baud`, would have decreasing stamps.
         """
         at_ns = self.chunk_ns - round(bytes_since * self._byte_ns)
         self._stamp_ns = max(self._stamp_ns, at_ns)

@@ -1,4 +1,4 @@
-"""Reception of a device on a serial port, across all attempts of its driver."""
+"""Reception of the data of a device on a serial port, across all connection attempts."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     Start = Callable[[SerialPort, bool], Awaitable[None]]
 
 _HUNT_EVERY = 10
-"""Number of connection attempts of which one also searches at other speeds. A search takes longer
-than an attempt."""
+"""One in this number of connection attempts also searches at other line speeds. A search takes
+longer than an attempt."""
 
 
 class SerialReception:
@@ -33,7 +33,7 @@ class SerialReception:
         self._attempts = 0
 
     async def run(self, emit: Emit, start: Start) -> None:
-        """Read until cancelled.
+        """Open the port, start the device, and emit its data until cancelled.
 
         Parameters
         ----------
@@ -41,7 +41,7 @@ class SerialReception:
             Function that receives every chunk after the start.
         start : callable
             Function that starts the output of the device on the open port. Its second argument
-            states whether it may search for a silent device at other speeds.
+            states whether the function may search for a silent device at other line speeds.
         """
         settings = self._settings
         with SerialPort(settings.port, settings.baud) as port:

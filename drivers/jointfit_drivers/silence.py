@@ -1,4 +1,4 @@
-"""Diagnosis of a device on a serial line that does not answer, with a search at other line speeds.
+"""Diagnosis of a serial device that does not answer, with a search at other line speeds.
 
 Invariant: a device that answers at another speed continues to run as before, and its configuration
 is not changed.
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from jointfit_drivers.serial_conversation import SerialConversation
 
 _LISTEN_S = 0.15
-"""Duration of the search at each speed, s."""
+"""Longest wait for an answer at each speed, s."""
 _RESUME_S = 0.5
-"""Longest wait until the device continues to stream, s."""
+"""Longest wait for the reply to the request to continue streaming, s."""
 
 
 _LISTEN_FIRST_S = 0.4
-"""Duration of the search at each speed for a device that sends without a request, s."""
+"""Longest wait at each speed for a message of a device that sends without a request, s."""
 
 
 class SpeedConversation(Protocol):
@@ -31,10 +31,10 @@ class SpeedConversation(Protocol):
 
     @property
     def understood(self) -> int:
-        """Number of messages received since the reset."""
+        """Number of messages received since the last reset."""
 
     def reset(self) -> None:
-        """Discard received bytes."""
+        """Discard received bytes, and set `understood` to 0."""
 
 
 async def find_other_speed(
@@ -44,7 +44,7 @@ async def find_other_speed(
     baud: int,
     answers: Callable[[], Awaitable[bool]],
 ) -> int | None:
-    """Return the speed at which the device answers or sends messages; None if there is none.
+    """Return the speed, bit/s, at which the device answers or sends; None if no speed is found.
 
     Parameters
     ----------
@@ -55,15 +55,15 @@ async def find_other_speed(
     baud
         Configured speed, which is not searched again.
     answers
-        Function that returns whether the device answers at the current speed of the port. The
-        device then continues to stream as before.
+        Function that returns whether the device answers at the current speed of the port. After
+        the call, the device streams as before.
     """
     for speed in speeds:
         if speed == baud:
             continue
         try:
             port.set_baud(speed)
-        except DeviceMisconfiguredError:  # the port does not support it
+        except DeviceMisconfiguredError:  # the port does not support this speed
             continue
         conversation.reset()
         if await answers() or conversation.understood:
@@ -87,31 +87,32 @@ async def explain_silence(
     Parameters
     ----------
     port, conversation
-        Open port, and conversation without an answer.
+        Open port, and conversation in which the device did not answer.
     baud
         Configured speed, bit/s.
     speeds
         Speeds to search, bit/s.
     hunt
-        Whether to search for a silent device. If the device's bytes cannot be decoded, the other
-        speeds are always searched.
+        Whether to search at other speeds if no byte arrived. If bytes arrived that cannot be
+        decoded, the other speeds are always searched.
     family
-        Name of the device's protocol, for messages.
+        Name of the device's protocol, for error messages.
     pause, resume
-        Functions that request the device to stop and to continue streaming. Their argument is the
-        longest wait for the reply, s. They return None if there is no reply.
+        Functions that request the device to stop streaming, and to continue. Their argument is the
+        longest wait for the reply, s. They return None if no reply arrives.
 
     Raises
     ------
     DeviceLostError
         The device sends nothing, or it streams but does not answer.
     DeviceMisconfiguredError
-        The device answers at another speed, or is of another kind.
+        The device answers at another speed, or does not use this protocol.
     """
     received = conversation.received
     if conversation.understood:
         raise DeviceLostError(
-            f"{port.path}: streams but does not answer: check the wire from host to device"
+            f"{port.path}: the device streams but does not answer: check the wire from host to "
+            "device"
         )
 
     async def answers() -> bool:
@@ -129,12 +130,13 @@ async def explain_silence(
         )
     if not received:
         raise DeviceLostError(
-            f"{port.path}: silent: check its power, and that TX and RX are not swapped"
+            f"{port.path}: the device is silent: check its power, and that TX and RX are not "
+            "swapped"
         )
     raise DeviceMisconfiguredError(
-        f"{port.path}: the device on this port does not use {family}: it sends bytes, none of them "
-        f"{family} at any common speed: correct `port` or `driver`, which "
-        "`jointfit probe` recognizes"
+        f"{port.path}: the device on this port does not use {family}: it sends bytes, but no "
+        f"{family} message at any common speed: correct `port` or `driver`; `jointfit probe` "
+        "recognizes the device on a port"
     )
 
 
@@ -146,30 +148,30 @@ async def explain_missing_messages(
     speeds: Sequence[int],
     family: str,
 ) -> NoReturn:
-    """Raise the error for a device that sends without a request, if no message has arrived.
+    """Raise the error for a device that sends without a request, if no measurement has arrived.
 
-    The function sends nothing. The parameters are those of `explain_silence`.
+    The function sends nothing. The parameters are described at `explain_silence`.
 
     Raises
     ------
     DeviceLostError
-        No bytes arrive, or the device sends only other messages.
+        No bytes arrive, or the device sends messages without measurements.
     DeviceMisconfiguredError
-        The device sends at another speed, or is of another kind.
+        The device sends at another speed, or does not use this protocol.
     """
     if not conversation.received:
         raise DeviceLostError(
-            f"{port.path}: silent: check its power and cable, and that the device sends without "
-            "a request"
+            f"{port.path}: the device is silent: check its power and cable, and that it sends "
+            "without a request"
         )
     if conversation.understood:
         raise DeviceLostError(
-            f"{port.path}: the device sends messages of {family}, but no measurement: switch this "
-            "output on"
+            f"{port.path}: the device sends messages of {family}, but no measurements: "
+            "switch their output on"
         )
 
     async def sends() -> bool:
-        # Every message is refused as a reply, so that no bytes from other speeds are emitted.
+        # No message counts as a reply, so that no bytes from other speeds are emitted.
         return await conversation.receive(lambda _: False, _LISTEN_FIRST_S) is not None
 
     speed = await find_other_speed(port, conversation, speeds, baud, sends)
@@ -179,7 +181,7 @@ async def explain_missing_messages(
             f"the device sends at {speed}: set baud = {speed}"
         )
     raise DeviceMisconfiguredError(
-        f"{port.path}: the device on this port does not use {family}: it sends bytes, none of them "
-        f"{family} at any common speed: correct `port` or `driver`, which "
-        "`jointfit probe` recognizes"
+        f"{port.path}: the device on this port does not use {family}: it sends bytes, but no "
+        f"{family} message at any common speed: correct `port` or `driver`; `jointfit probe` "
+        "recognizes the device on a port"
     )

@@ -1,8 +1,8 @@
-"""Clock of a device without message counter: lost messages, restarts, and undetected corruption.
+"""Check of device time for lost messages, restarts and corruption, without a message counter.
 
-A message *follows* another message if device time did not decrease, and if it advanced by at most a
-few periods or by as much as the arrival times. A backlog of buffered messages is taken into
-account.
+A message *follows* another message if device time did not decrease, and if it advanced by at most
+five periods or by about as much as the arrival time. The second comparison allows for a backlog of
+buffered messages.
 
 | message                                       | outcome                                         |
 |-----------------------------------------------|-------------------------------------------------|
@@ -16,7 +16,7 @@ account.
 A checksum passes some corrupt messages, so a single message never proves a restart. The period of
 the stream is determined from three steps of about the same size.
 
-Invariant: the result depends only on the times fed, and every input is accepted.
+Invariant: the result depends only on the times fed, and no input raises an exception.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from typing import NamedTuple
 from jointfit_drivers.backlog import BacklogDelay, device_continued
 
 _FEW = 5
-"""Number of periods by which device time may advance, whatever the elapsed arrival time is."""
+"""Number of periods by which device time may always advance, regardless of the arrival time."""
 _GAP = 1.5
 """Largest step without a lost message, periods."""
 _ALIKE = 0.3
@@ -36,9 +36,10 @@ _STEPS = 3
 _GAIN = 0.125
 """Weight of a new step in the running mean of the period."""
 _PACE_NS = 250_000_000
-"""Largest difference between elapsed device and arrival time without restart or backlog, ns."""
+"""Largest difference between elapsed device time and elapsed arrival time without a restart or a
+backlog, ns. After the same time with messages at the device's own rate, the delay is known."""
 _LATEST_NS = 30_000_000_000
-"""Longest delay of the first messages after opening, ns."""
+"""Longest delay of the first messages after the port is opened, ns."""
 
 
 class TimeStep(NamedTuple):
@@ -49,7 +50,7 @@ class TimeStep(NamedTuple):
     held: bool = False
     """Whether this message must be held until the next message."""
     restarted: bool = False
-    """Whether the held message is valid and is the first message of a restarted clock."""
+    """Whether the previously held message is valid, as the first message of a restarted clock."""
 
 
 class _Instant(NamedTuple):

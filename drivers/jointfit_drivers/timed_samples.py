@@ -47,7 +47,7 @@ class TimedReading(NamedTuple):
     """Length on the wire, bytes."""
     arrival_ns: int
     ticks: int | None
-    """Device time, ns; None if the message contains none."""
+    """Device time, ns; None if the message contains no device time."""
     q_world_sensor: Quaternion | None = None
     """Orientation q_world_sensor in an ENU world, with any norm."""
     q_native: Quaternion | None = None
@@ -65,7 +65,7 @@ class TimedSamples(Refusals):
         Function that returns a new filter of raw measurements; None if the device sends
         orientations.
     untimed_remedy : str
-        Remedy in the warning about readings without time.
+        Remedy in the warning about readings without device time.
     """
 
     def __init__(self, make_raw: Callable[[], RawSamples] | None, untimed_remedy: str) -> None:
@@ -85,11 +85,11 @@ class TimedSamples(Refusals):
             out: list[Decoded] = []
             if not self._untimed:
                 self._untimed = True
-                text = f"orientation without time in its message: {self._untimed_remedy}"
+                text = f"orientation without device time in its message: {self._untimed_remedy}"
                 out.append(DeviceEvent("warning", text))
 
-            # An orientation without time is stamped with its arrival, unless other readings have a
-            # time. The filter of raw measurements needs a time.
+            # An orientation without device time is stamped with its arrival, unless other readings
+            # have a device time. The filter of raw measurements needs a device time.
             if self._timed or self._make_raw is not None:
                 return [*out, self.refuse(reading.size, "orientation without time")]
             return out + self._samples(reading)
@@ -116,7 +116,7 @@ class TimedSamples(Refusals):
 
     @override
     def flush(self) -> list[Decoded]:
-        """Reject a reading that no later reading confirmed."""
+        """Reject the held reading, which no later reading confirmed, and return the events."""
         held, self._held = self._held, None
         return [] if held is None else [self.refuse(held.size, "time disagrees with the others")]
 

@@ -166,7 +166,7 @@ async def test_a_newer_vrpn_server_is_used_with_a_warning() -> None:
         async with reading.running():
             await reading.until(lambda: bool(reading.frames))
     (text,) = [text for text in reading.texts() if UPDATE in text]
-    assert text.startswith("VRPN 07.40 is newer than 7.38, the newest known here")
+    assert text.startswith("VRPN 07.40 is newer than 7.38, the newest known version")
 
 
 def test_newer_messages_of_the_other_servers_are_named() -> None:
@@ -178,7 +178,7 @@ def test_newer_messages_of_the_other_servers_are_named() -> None:
     known = qtm_feeder.ready()
     known(qtm.Event(16), qtm.Event(99), qtm.Event(99))
     assert [text for text in known.texts("warning") if UPDATE in text] == [
-        "the device sends event 99, which this version does not know (firmware not reported); it "
+        "the device sends event 99, which jointfitd does not know (firmware not reported); it "
         "is ignored, known contents are used: update jointfitd, or disable this output with QTM"
     ]
 
@@ -238,4 +238,4 @@ def test_contents_of_unknown_kind_or_size_are_named_once(
     (text,) = [
         item.text for item in events if isinstance(item, DeviceEvent) and UPDATE in item.text
     ]
-    assert text.startswith(f"the device sends {content}, which this version does not know")
+    assert text.startswith(f"the device sends {content}, which jointfitd does not know")

@@ -211,7 +211,7 @@ def test_a_device_that_sends_other_messages_only_is_not_at_another_speed() -> No
             port, conversation, baud=115_200, speeds=(115_200, 57_600), family="pairs"
         )
 
-    with pytest.raises(DeviceLostError, match="no measurement: switch this output on"):
+    with pytest.raises(DeviceLostError, match="no measurements: switch their output on"):
         asyncio.run(scene())
 
 

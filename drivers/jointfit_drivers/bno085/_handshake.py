@@ -2,8 +2,8 @@
 
 In the mode UART-RVC, the device sends without a request and ignores the host. In the mode
 UART-SHTP, it is silent after a reset. The driver reads the settings of the reports, and changes
-only settings that differ. The device loses these settings at the next reset, because the driver
-does not store them.
+only settings that differ from rig.toml. The device loses these settings at the next reset, because
+the driver does not store them.
 
 Source: BNO08X data sheet 1000-3927, section 1.3.1. Bytes to the device must be separated by 100 us.
 """
@@ -48,7 +48,7 @@ _REPLY_S = 0.5
 _BYTE_PAUSE_S = 0.0002
 """Pause between two bytes to the device, s."""
 _RATE_TOLERANCE = 0.1
-"""Largest relative difference between requested and effective interval."""
+"""Largest relative difference between the required interval and the interval of the device."""
 
 
 class ShtpConversation(SerialConversation[ShtpPacket | ShtpBufferStatus]):
@@ -66,7 +66,7 @@ class ShtpConversation(SerialConversation[ShtpPacket | ShtpBufferStatus]):
             await asyncio.sleep(_BYTE_PAUSE_S)
 
     async def control(self, data: bytes, *, tries: int) -> bytes | None:
-        """Send a request on the control channel, and return its reply; None if there is none.
+        """Send a request on the control channel, and return its reply; None if none arrives.
 
         The reply to a request for the product id is the product id. The reply to a request for a
         report is the settings of the report.
@@ -83,7 +83,7 @@ class ShtpConversation(SerialConversation[ShtpPacket | ShtpBufferStatus]):
 
 
 def _reply_to(request: bytes, message: ShtpPacket | ShtpBufferStatus) -> bytes | None:
-    """Return the report in `message` that answers `request`; None if there is none."""
+    """Return the report in `message` that answers `request`; None if no report does."""
     if not isinstance(message, ShtpPacket) or message.channel != ShtpChannel.CONTROL:
         return None
     for report in split_reports(message.payload) or ():
@@ -113,12 +113,12 @@ async def ensure_rvc(port: SerialPort, emit: Emit, settings: Bno085Settings) -> 
         return
     if not conversation.received:
         raise DeviceLostError(
-            f"{settings.port}: no data: check its power, and that PS0 is high and PS1 low "
-            f"(UART-RVC); for UART-SHTP set baud = {SHTP_BAUD}"
+            f"{settings.port}: no data: check the device's power, and that PS0 is high and PS1 is "
+            f"low (UART-RVC); for UART-SHTP set baud = {SHTP_BAUD}"
         )
     raise DeviceMisconfiguredError(
-        f"{settings.port}: {conversation.received} bytes at {RVC_BAUD} baud, none of them a frame "
-        f"of UART-RVC: correct `port` or `driver`; for UART-SHTP set baud = {SHTP_BAUD}"
+        f"{settings.port}: {conversation.received} bytes at {RVC_BAUD} baud, but no UART-RVC "
+        f"frame: correct `port` or `driver`; for UART-SHTP set baud = {SHTP_BAUD}"
     )
 
 
@@ -168,10 +168,11 @@ async def _interval(
 async def _explain_silence(
     port: SerialPort, conversation: ShtpConversation, settings: Bno085Settings
 ) -> NoReturn:
-    """Raise the error for a device that does not answer."""
+    """Raise the error that explains why the device does not answer."""
     if conversation.understood:
         raise DeviceLostError(
-            f"{settings.port}: sends, but does not answer: check the wire from host to device"
+            f"{settings.port}: the device sends, but does not answer: check the wire from host to "
+            "device"
         )
 
     received = conversation.received
@@ -188,9 +189,9 @@ async def _explain_silence(
         raise DeviceMisconfiguredError(
             f"{settings.port}: {received} bytes at {SHTP_BAUD} baud without an SHTP packet, and "
             f"{rvc.received} bytes at {RVC_BAUD} baud without a UART-RVC frame: correct `port` or "
-            "`driver`, which `jointfit probe` recognizes"
+            "`driver`; `jointfit probe` recognizes the device on a port"
         )
     raise DeviceLostError(
-        f"{settings.port}: silent: check its power, that PS1 is high and PS0 low (UART-SHTP), and "
-        "that TX and RX are not swapped"
+        f"{settings.port}: the device is silent: check its power, that PS1 is high and PS0 is low "
+        "(UART-SHTP), and that TX and RX are not swapped"
     )

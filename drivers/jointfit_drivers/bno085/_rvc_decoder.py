@@ -11,9 +11,9 @@ roll 20.85 degrees with accelerations of -371, -20 and 977 mg. With pitch about 
 .. math:: R = R_z(\text{yaw})\, R_x(\text{pitch})\, R_y(\text{roll}), \qquad
     R^T e_z = (-0.356, -0.019, 0.934),
 
-which is the measured direction (-0.355, -0.019, 0.935). With ``zyx`` the direction is (0.019,
-0.356, 0.934). The default is therefore ``zxy``. Accelerations at rest show which order of axes fits
-the device.
+which agrees with the measured direction (-0.355, -0.019, 0.935). With ``zyx`` the direction is
+(0.019, 0.356, 0.934). The default is therefore ``zxy``. The decoder also compares both orders
+with the accelerations at rest, and warns if the other order fits better.
 
 Invariant: the output depends only on the chunks fed; the decoder reads no clock and no port.
 """
@@ -46,11 +46,11 @@ _MOST_LOST = 128
 _REST = 0.06
 """Largest relative deviation of an acceleration from 1 g at rest."""
 _DISTINCT = 0.2
-"""Smallest difference between the two computed directions of gravity for a comparison."""
+"""Smallest distance between the two computed unit vectors of gravity for a comparison."""
 _COMPARED = 100
 """Number of frames at rest after which the two orders of axes are compared."""
 _BETTER = 3.0
-"""Ratio of the two mean deviations from which the other order of axes fits better."""
+"""Smallest ratio of the deviations of the configured and the other order that causes a warning."""
 _G_COUNTS = 1000.0
 
 
@@ -73,7 +73,7 @@ class RvcDecoder(SerialMessageDecoder[RvcFrame]):
         self._gate = OrientationGate()
         self._number: int | None = None
         self._compared = 0
-        self._deviations = [0.0, 0.0]  # sums: configured order of axes, other order
+        self._deviations = [0.0, 0.0]  # sums for the configured order and for the other order
 
     @override
     def _take(self, message: RvcFrame) -> list[Decoded]:
@@ -95,7 +95,7 @@ class RvcDecoder(SerialMessageDecoder[RvcFrame]):
         return out
 
     def _compare(self, frame: RvcFrame) -> list[Decoded]:
-        """Compare both axis orders with gravity at rest; warn if only the unused order fits."""
+        """Compare both axis orders with gravity at rest; warn if the unused order fits better."""
         x, y, z = frame.acceleration
         strength = sqrt(x * x + y * y + z * z) / _G_COUNTS
         if abs(strength - 1.0) > _REST:
@@ -130,7 +130,7 @@ def quaternion_of(angles: tuple[int, int, int], euler: Literal["zxy", "zyx"]) ->
 
 
 def gravity_of(angles: tuple[int, int, int], euler: Literal["zxy", "zyx"]) -> Vector:
-    """Return the upward direction in sensor axes."""
+    """Return the unit vector that points upwards, in sensor axes."""
     w, x, y, z = quaternion_of(angles, euler)
     return (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z)
 

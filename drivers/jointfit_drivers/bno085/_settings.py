@@ -22,7 +22,7 @@ MAX_RATE_HZ = 400
 """Highest rate of rotation vectors, Hz."""
 _BITS = 10
 _PACKET_BYTES = 31
-"""Length of a packet with base time, rotation vector, flags and some escape bytes, bytes."""
+"""Length, bytes, of a packet with base time, rotation vector, flags and some escape bytes."""
 _REPORTS = {
     "rotation_vector": HubReportId.ROTATION_VECTOR,
     "game_rotation_vector": HubReportId.GAME_ROTATION_VECTOR,
@@ -41,8 +41,8 @@ class Bno085Settings(SerialImuSettings, GatewaySettings):
     ] = Field(
         "rotation_vector",
         description="orientation that UART-SHTP sends; `game`: without magnetometer, the heading "
-        "drifts; `arvr`: corrections are spread over motion; `gyro`: with rates of turn and the "
-        "least delay",
+        "drifts; `arvr`: gradual corrections during motion; `gyro`: with rates of turn and the "
+        "shortest delay",
     )  # fmt: skip
     euler: Literal["zxy", "zyx"] = Field(
         "zxy",

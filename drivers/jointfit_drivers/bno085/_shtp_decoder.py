@@ -54,9 +54,9 @@ _RESET_COMPLETE = b"\x01"
 _PERIOD_COUNTS = 200
 """Number of readings after which their measured period replaces the nominal period."""
 _STALE_COUNTS = 2
-"""Number of gyroscope readings after which an acceleration is too old."""
+"""Largest number of gyroscope readings for which one acceleration is used."""
 _SATURATED = 32_760
-"""Smallest absolute count of a gyroscope or accelerometer that counts as out of range."""
+"""Smallest absolute raw value of a gyroscope or accelerometer that is out of range, counts."""
 _NEWEST = NewestKnown((3,), "the host that configures the device")
 """Newest version of the SH-2 software that the reference manual describes."""
 _CHANNELS = frozenset(map(int, ShtpChannel))
@@ -74,8 +74,8 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         Filter that computes orientations from raw readings; None if the device sends rotation
         vectors.
     preferred : int
-        Rotation vector that is used if the device sends several kinds, whose headings differ. Until
-        it arrives, the first kind is used.
+        Kind of rotation vector that is used if the device sends several kinds. Their headings
+        differ. Until this kind arrives, the kind that arrived first is used.
     """
 
     tick_clock = None  # reports have an age, but no time
@@ -150,7 +150,7 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
             if not -_OLDEST <= age <= _OLDEST:
                 return [*out, self._refusals.refuse(packet.size - 2, "time out of range")]
 
-            # A report may follow a younger report of another sensor, but stamps must never
+            # A report may follow a later measurement of another sensor, but stamps must never
             # decrease.
             self._arrival_ns = max(self._arrival_ns, sent_ns - max(age, 0) * TICK_NS)
             if self._raw is not None:
@@ -210,7 +210,7 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         return kind == self._selected
 
     def _step(self, report: HubReport) -> tuple[int, list[Decoded]]:
-        """Return the number of steps since this sensor's last report, and an event after a loss."""
+        """Return by how much the report number increased, and an event if reports were lost."""
         last = self._sequences.get(report.report_id)
         self._sequences[report.report_id] = report.sequence
         step = 1 if last is None else (report.sequence - last) % _COUNTS
@@ -220,7 +220,7 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         return step, [DeviceEvent("gap", f"{lost} messages lost", {"lost": lost})]
 
     def _reading(self, report: HubReport, raw: RawSamples) -> list[Decoded]:
-        """Process a raw reading. A gyroscope reading returns a sample."""
+        """Add a raw reading; return the samples and events that a gyroscope reading completes."""
         kind = report.report_id
         if kind == HubReportId.ACCELEROMETER:
             self._force, self._force_age = report, 0
@@ -248,7 +248,7 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         return out + raw.take(stamp, reading, clipped=clipped)
 
     def _time_of_reading(self, step: int, nominal_ns: float) -> int:
-        """Return the time of a reading, ns, which advances by the mean period per reading.
+        """Return the time since the first reading, ns. It advances by the mean period per reading.
 
         The device has no clock, so the period is computed from the arrivals since the first
         reading.

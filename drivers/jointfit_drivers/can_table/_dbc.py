@@ -24,7 +24,7 @@ PACKAGE_MISSING = (
 )
 _MOST_VALUES = 1024
 """Largest number of values of a multiplexer in one range. `cantools` needs a time proportional to
-the square of the number."""
+the square of this number."""
 _DIGITS = 9
 """Largest number of digits of a value in a range."""
 _MULTIPLEXED = re.compile(r"SG_MUL_VAL_\s+\d+\s+(?P<signal>\w+)\s+\w+\s+(?P<ranges>[\d\s,-]+);")
@@ -54,13 +54,13 @@ class DbcSignal(NamedTuple):
 
 
 def read_signals(path: str, names: Sequence[str]) -> list[DbcSignal]:
-    """Return signals of a DBC file. Their names are SIGNAL or MESSAGE.SIGNAL.
+    """Return the signals `names` of a DBC file. A name is SIGNAL or MESSAGE.SIGNAL.
 
     Raises
     ------
     FieldFaultError
-        The package or the file is missing, the file is malformed, or its signals overlap. Or a
-        signal is missing or ambiguous.
+        The package, the file or a signal is missing, the file is malformed, its signals overlap,
+        or a name is ambiguous.
     """
     if find_spec("cantools") is None:
         raise FieldFaultError("signals", PACKAGE_MISSING)
@@ -75,8 +75,8 @@ def read_signals(path: str, names: Sequence[str]) -> list[DbcSignal]:
 
 @lru_cache(maxsize=8)
 def _messages(path: str, stamp: int) -> list[Any] | str:
-    """Return the messages of a file, or the reason why it cannot be used."""
-    del stamp  # a changed file is read again
+    """Return the messages of a file, or the reason why the file cannot be used."""
+    del stamp  # part of the cache key, so that a changed file is read again
     import cantools  # noqa: PLC0415 - an extra
 
     try:
@@ -153,7 +153,7 @@ def _multiplexer(message: Any, signal: Any) -> Multiplexer | None:
     Raises
     ------
     FieldFaultError
-        The multiplexer has none of the values.
+        The multiplexer has too few bits for all of the values.
     """
     if signal.multiplexer_ids is None:
         return None

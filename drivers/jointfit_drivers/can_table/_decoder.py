@@ -1,8 +1,8 @@
 """Decoder of the driver can-table: converts records of CAN frames to samples in SI units.
 
 The stamp of a sample is the arrival of its first frame, because arbitration may delay the later
-frames. A record of 24 bytes is a frame of this device, a frame of another device, a note of the
-host, or a rejected record.
+frames. A chunk contains records of 24 bytes. A record contains a CAN frame, an error frame of the
+controller, or the number of frames or bytes that this host lost.
 
 Invariant: the output depends only on the chunks fed. The decoder reads no clock and no bus.
 """
@@ -28,7 +28,7 @@ _UNMATCHED = 200
 """Number of frames with unknown values of the multiplexer, before the first complete sample, that
 causes a warning."""
 _LISTED = 6
-"""Largest number of frames in a warning."""
+"""Largest number of frame names in a warning."""
 
 
 class CanTableDecoder:
@@ -61,7 +61,7 @@ class CanTableDecoder:
 
     @property
     def discarded_bytes(self) -> int:
-        """Number of bytes in rejected records, and on an adapter's line that formed no frame."""
+        """Number of bytes in rejected records, plus adapter bytes that formed no frame."""
         return self._bus.discarded_bytes + self._samples.refused_bytes
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
@@ -105,12 +105,16 @@ class CanTableDecoder:
         )
 
     def flush(self) -> list[Decoded]:
-        """Discard an incomplete sample, and a sample that waits for confirmation."""
+        """Discard an incomplete sample; reject a sample that waits for confirmation.
+
+        Return the events that result.
+        """
         self._codec.flush()
         return self._samples.flush()
 
 
 _INCOMPLETE = (
-    f"no complete sample after {_HALVED} incomplete ones: correct `sequence` if the device sends "
-    "the frames in another order; correct `rate_hz` if a sample takes longer than half a period"
+    f"no complete sample after {_HALVED} incomplete samples: correct `sequence` if the device "
+    "sends the frames in another order; correct `rate_hz` if a sample takes longer than half a "
+    "period"
 )

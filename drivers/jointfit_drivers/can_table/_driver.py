@@ -1,4 +1,4 @@
-"""Driver of IMUs on a CAN bus that rig.toml or a DBC file describes.
+"""Driver of IMUs on a CAN bus whose frames rig.toml or a DBC file describes.
 
 The driver sends nothing, because a table does not describe how a device is configured.
 """
@@ -31,7 +31,7 @@ class CanTableImu:
         return CanTableDecoder(settings.can_table(), settings.sample_form())
 
     async def run(self, emit: Emit) -> None:
-        """Read the bus until cancelled.
+        """Emit the frames of the device until cancelled.
 
         Raises
         ------

@@ -121,9 +121,9 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
 
     @override
     def contradictions(self) -> Iterator[tuple[str, str]]:
-        """Yield the keys whose fields do not fit the frames."""
+        """Yield each key that contradicts another key or the DBC file, and the reason."""
         if not self._is_readable():
-            return  # already reported; no positions are known
+            return  # the invalid keys are already reported
         faults = list(self._id_faults())
         yield from faults
         if faults:
@@ -181,7 +181,7 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
         )
 
     def multiplexers(self) -> dict[int, Multiplexer]:
-        """Return the multiplexers of the frames that have one, by their places in `order`."""
+        """Return the multiplexer of each multiplexed frame, by the frame's index in `order`."""
         return self._multiplexers()[0]
 
     def _place(self, name: Quantity, part: FieldSettings, count: int) -> list[TableField]:
@@ -196,7 +196,7 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
             if getattr(part, key) is not None:
                 raise FieldFaultError(key, "is in the DBC file: remove it")
         if len(signals) != count:
-            text = f"{len(signals)} signals for {count} components: expected one each"
+            text = f"{len(signals)} signals for {count} components: expected one signal for each"
             raise FieldFaultError("signals", text)
         placed = []
         for found in read_signals(self.dbc, signals):
@@ -212,7 +212,7 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
         return placed
 
     def _frame_of_signal(self, key: CanKey, name: str, part: FieldSettings) -> int:
-        """Return the number of the frame that contains a signal of the DBC file."""
+        """Return the index in `order` of the frame that contains a signal of the DBC file."""
         order = self.order()
         possible = [number for number, each in enumerate(self.keys()) if each == key]
         if len(possible) == 1:
@@ -259,7 +259,7 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
         return found, list(dict.fromkeys(faults))
 
     def _first_bytes(self) -> dict[str, TableField]:
-        """Return the positions of `starts_with`, by the keys in rig.toml."""
+        """Return the positions of the bytes of `starts_with`, by the keys in rig.toml."""
         order = self.order()
         return {
             f"starts_with.{name}": TableField(
@@ -281,7 +281,7 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
                             yield quantity, number, signal.multiplexer
 
     def _frame(self, name: Quantity, part: FieldSettings) -> int:
-        """Return the number of the frame that contains a field."""
+        """Return the index in `order` of the frame that contains a field."""
         order = self.order()
         frame = getattr(part, "frame", None)
         if frame is None:
@@ -309,7 +309,7 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
             yield "sequence", f"expected each name of `ids` once: {', '.join(self.ids)}"
 
     def _shared_id_faults(self) -> Iterator[tuple[str, str]]:
-        """Yield the frames whose data do not distinguish them from another frame."""
+        """Yield each frame that has the identifier of another frame but no distinguishing data."""
         order, multiplexers = self.order(), self.multiplexers()
         for at, name in enumerate(order):
             for before, owner in enumerate(order[:at]):

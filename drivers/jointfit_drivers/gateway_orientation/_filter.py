@@ -2,34 +2,34 @@ r"""Computation of the orientation from the raw measurements of one IMU, by the 
 
 VQF stands for "versatile quaternion-based filter". A relative error of the sample interval causes
 the same relative error of every rotation. The interval is therefore computed from the device time
-(`RawReading.t_ns`). The filter has a fixed step, which is the first interval T_s. If ticks are too
-coarse for one interval, the mean interval differs from the first. Angular rates are then scaled so
-that every step rotates by the true angle:
+(`RawReading.t_ns`). The filter has a fixed step, which is the first interval T_s. If the ticks are
+too coarse for one interval, the mean interval differs from the first interval. Angular rates are
+then scaled so that every step rotates by the true angle:
 
 .. math:: \omega_\text{fed} = \omega\, \bar T / T_s
 
-Up to three missing measurements are interpolated. After a longer gap the filter restarts. It
-retains the gyroscope bias. Without a magnetometer, it continues with the last heading, which is
-then uncertain.
+Up to three missing measurements are interpolated. After a longer gap the filter restarts with the
+last gyroscope bias. Without a magnetometer, it also continues with the last heading, which is then
+uncertain.
 
 A filter that has just started takes its vertical from one accelerometer measurement. In fast motion
-the error of the orientation is 18 degrees in the first second, 6 degrees in the second and 4
-degrees in the third. After that it is as small as usual (experiment
-``gateway-orientation-start-in-motion``). Orientations are therefore returned only when the filter
-has detected rest or has run for `SETTLE_S`, or for ``settle_s`` if this time is shorter.
+the RMS error of the orientation is 18 degrees in the first second, 6 degrees in the second and 4
+degrees in the third (one IMU on a rigid board, experiment ``gateway-orientation-start-in-motion``).
+Orientations are therefore returned only when the filter has detected rest or has run for
+`SETTLE_S`, or for ``settle_s`` if this time is shorter.
 
 With a magnetometer, `StartEstimator` then estimates orientation and gyroscope bias from the
 readings since the start, and continues with every reading. Orientations are returned when their
-standard deviation is at most `SETTLED_SD`, or after ``settle_s``. VQF takes over the result at the
-first rest, or when the standard deviation of the bias is at most `KNOWN_BIAS_SD`, or after
-`CONVERGE_S` at the latest.
+standard deviation is at most `SETTLED_SD`, or after ``settle_s``. The estimation ends, and its
+result is copied to VQF, at the first rest, or when the standard deviation of the bias is at most
+`KNOWN_BIAS_SD`, or after `CONVERGE_S` at the latest.
 
-A magnetometer has a delay relative to the gyroscope. For the recorded sensor the delay is 13 ms,
-which causes an error of 8 degrees at an angular rate of 579 degrees per second. The delay is
-estimated from the readings since the start, and compensated.
+A magnetometer has a delay relative to the gyroscope. For the IMU of the BROAD data set, the delay
+is 13 ms, which causes an error of 8 degrees at an angular rate of 579 degrees per second. The
+filter estimates the delay from the readings since the start, and compensates it.
 
 Invariant: the output depends only on the readings fed, so a replay yields identical orientations.
-Only this module imports ``vqf`` (an extra), and it names no device.
+Only this module imports the optional package ``vqf``. The module is independent of the device.
 
 Source: Laidig and Seel 2023, Information Fusion 91, 187-204, and their package ``vqf``.
 """
@@ -65,12 +65,13 @@ PACKAGE_MISSING = (
 MOST_MISSING = 3
 """Largest number of consecutive missing readings that are interpolated; more restart the filter."""
 SETTLE_S = 3.0
-"""Time constant of the filter's accelerometer, s. The vertical is a mean over this time."""
+"""Time constant of the low-pass filter of the accelerometer, s. The vertical is a mean over this
+time."""
 LONGEST_SETTLE_S = 8.0
-"""Default of ``settle_s``, the time after which orientations are returned, however uncertain they
-are, s."""
+"""Default of ``settle_s``, s. After this time orientations are returned, however uncertain they
+are."""
 SETTLED_SD = radians(5.0)
-"""Standard deviation of the angle of the orientation at which a filter counts as settled, rad."""
+"""Largest standard deviation of the angle of the orientation of a settled filter, rad."""
 CONVERGE_S = 60.0
 """Longest duration of the estimation at the start, s."""
 KNOWN_BIAS_SD = radians(0.1)
@@ -134,7 +135,7 @@ class FilterState(NamedTuple):
     """State of the filter for reports."""
 
     rest: bool
-    """Whether the sensor is at rest, so that its bias is being estimated."""
+    """Whether the filter detects rest. At rest it estimates the gyroscope bias."""
     bias: Vector
     """Gyroscope bias, rad/s."""
     bias_sd: float
@@ -152,7 +153,7 @@ def is_installed() -> bool:
 
 
 def is_plausible(reading: RawReading) -> bool:
-    """Return whether a reading is finite and in range. A single NaN would stay in the filter."""
+    """Return whether a reading is finite and in range. One NaN would spoil all later outputs."""
     if not all(-FASTEST < value < FASTEST for value in reading.rate):
         return False
     if not all(-HARDEST < value < HARDEST for value in reading.force):
@@ -168,7 +169,7 @@ class GatewayOrientation:
     rate_hz : float
         Nominal rate, Hz, which is used only until the second reading.
     magnetometer : bool
-        Whether the heading comes from the magnetometer (9D). Otherwise it drifts (6D).
+        Whether the heading comes from the magnetometer (9D). Otherwise the heading drifts (6D).
     settle_s : float
         Longest time without output after a start of the filter, s. Without magnetometer this time
         is at most `SETTLE_S`.
@@ -262,7 +263,7 @@ class GatewayOrientation:
         self._withheld = deque(maxlen=ceil(SETTLE_S * NS_PER_S / period_ns) + MOST_MISSING)
         self._estimator = None
         self._filter = import_module("vqf").VQF(period_ns / NS_PER_S)  # ``vqf`` is an extra
-        # The integrated orientations assume a constant bias until the start is estimated.
+        # `StartEstimator` needs orientations that were integrated with a constant bias.
         self._filter.setMotionBiasEstEnabled(not (self._magnetic and self.settling))
 
     def _update(self, reading: RawReading, *, follows: bool = True) -> FilterOutput:
@@ -292,7 +293,7 @@ class GatewayOrientation:
         return self._output(reading, follows=follows)
 
     def _settle(self, t_ns: int, waited_ns: int) -> None:
-        """Begin to estimate orientation and bias, and record whether the filter has settled."""
+        """Start the estimation if it is due, and record whether the filter has settled."""
         rest = self._filter.getRestDetected()
         if not rest and waited_ns < min(self._settle_ns, SETTLE_S * NS_PER_S):
             return
@@ -331,7 +332,7 @@ class GatewayOrientation:
         self._continue_start(self._estimator, t_ns)
 
     def _continue_start(self, estimator: StartEstimator, t_ns: int) -> None:
-        """Set the filter to the estimated bias; at the end, set it to all estimates."""
+        """Set the bias of VQF to the estimate; at the end, set all state variables of VQF."""
         known = estimator.bias_sd <= KNOWN_BIAS_SD
         late = t_ns - self._converging_ns >= CONVERGE_S * NS_PER_S
         if not (known or late or self._filter.getRestDetected()):
@@ -382,16 +383,16 @@ class GatewayOrientation:
 def _field_delay(
     q: NDArray[np.float64], rates: NDArray[np.float64], fields: NDArray[np.float64]
 ) -> float | None:
-    r"""Return the delay of the magnetometer relative to the gyroscope, s; None without rotation.
+    r"""Return the delay of the magnetometer relative to the gyroscope, s; None if it is unknown.
 
     The field is constant in the world. If the measured field m has a delay d, the field rotated to
     the world is, to first order,
 
     .. math:: R m = m_w + d\, R (\omega \times m) ,
 
-    which is a linear regression. The ridge of the regression assumes a disturbance of 2 % of the
-    field and a delay of 20 ms. If the rotation is too slow to exceed the ridge, the delay is
-    unknown. Fields of implausible strength are excluded.
+    which is a linear regression with a ridge term. The ridge term corresponds to a disturbance of
+    2 % of the field and a delay of 20 ms. If the rotation is so slow that the ridge term dominates,
+    the delay is unknown. Fields of implausible strength are excluded.
 
     Parameters
     ----------
@@ -428,7 +429,7 @@ def turned_field(field: Vector, rate: Vector, delay_s: float) -> Vector:
 
 
 def _heading_between(q_from: Quaternion, q_to: Quaternion) -> Quaternion:
-    """Return the rotation about the vertical that minimizes the angle from `q_from` to `q_to`."""
+    """Return the rotation about the vertical that brings `q_from` closest to `q_to`."""
     w, x, y, z = q_from
     a, b, c, d = q_to
     half = atan2(d * w - a * z - b * y + c * x, a * w + b * x + c * y + d * z)

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from jointfit_drivers.gateway_orientation._settings import GatewaySettings
 
 _REPORT_NS, _SOON_NS = 10_000_000_000, 1_000_000_000
-"""Interval between two events with the state of the filter, ns, and shortest interval after a
-change."""
+"""Interval between two events with the state of the filter, and shortest interval after the state
+has changed, ns."""
 FAST = 5.0
 """Angular rate below which no gyroscope saturates, rad/s."""
 _NEW_HEADING = (
@@ -58,13 +58,13 @@ class RawSamples:
     rate_hz : float
         Nominal rate, Hz.
     magnetometer : bool
-        Whether heading comes from the magnetometer.
+        Whether the heading comes from the magnetometer.
     settle_s : float
         Longest time without output after a start of the filter, s.
     correction : SensorCorrection, optional
         Correction of the readings; None if the sensor is not calibrated.
     readings_only : bool
-        Whether uncorrected readings are returned without orientation, for a calibration.
+        Whether uncorrected readings are returned without orientation, for a sensor calibration.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class RawSamples:
         return self._filter.period_ns
 
     def correct_field(self, field: Vector) -> Vector:
-        """Return a magnetic field, corrected for the errors of the sensor if they are known."""
+        """Return a magnetic field, corrected if the sensor is calibrated."""
         return field if self._correction is None else self._correction.correct_field(field)
 
     def take(
@@ -132,7 +132,7 @@ class RawSamples:
         reading
             Measurements of the message. Their time must be later than that of the previous reading.
         clipped
-            Whether the device reported that a measurement is out of range.
+            Whether the driver found that a measurement is out of range.
         field_corrected
             Whether `correct_field` was already applied to the magnetic field.
         """
@@ -181,7 +181,7 @@ class RawSamples:
         return out
 
     def _state_events(self) -> list[Decoded]:
-        """Return the event with the filter's state if it is due, and the first heading warning."""
+        """Return the event with the filter's state if it is due, and once the heading warning."""
         out: list[Decoded] = []
         if not self._started and not self.magnetometer:
             out.append(DeviceEvent("warning", _NEW_HEADING))

@@ -18,7 +18,7 @@ from jointfit_drivers.gateway_orientation._filter import (
 
 
 class GatewaySettings(ImuSettings):
-    """Choice between the orientation of the device and that of the gateway."""
+    """Choice whether the device or the gateway computes the orientation."""
 
     orientation: Literal["device", "gateway"] = Field(
         "device",
@@ -74,14 +74,14 @@ class GatewaySettings(ImuSettings):
         if found is not None and info.data.get("orientation") == "device":
             raise ValueError(
                 'needs orientation = "gateway": the device computes its orientation from '
-                "uncorrected readings. Set it, or remove this table"
+                "uncorrected readings. Set this value, or remove this table"
             )
         return found
 
     @field_validator("magnetometer")
     @classmethod
     def _magnetometer_of_a_filter(cls, magnetometer: bool, info: ValidationInfo) -> bool:
-        """Reject the use of a magnetometer if the gateway has no filter."""
+        """Reject the key if the device computes the orientation."""
         if magnetometer and info.data.get("orientation") == "device":
             raise ValueError(
                 'needs orientation = "gateway": with "device", the settings of the device decide '

@@ -1,4 +1,4 @@
-r"""Orientation, gyroscope bias and field of an IMU whose orientation filter has just started.
+r"""Orientation, bias and magnetic field of an IMU whose orientation filter has just started.
 
 The orientation filter VQF takes the vertical from a mean over 3 s, and the heading from the field
 relative to that vertical. With a magnetic dip of 70 degrees, the error of the heading is 2.7 times
@@ -9,9 +9,9 @@ gravity and field, in steps of `STEP_S`. The state of the filter is
 .. math:: (\varphi, b, v, B_n, B_u)
 
 The components are the error of the orientation, rad, in the world; the bias, rad/s; the velocity
-relative to its mean, m/s; and the north and up components of the field. :math:`R` is the integrated
-orientation of a gyroscope with the assumed bias :math:`\hat b`. f is the specific force, and T the
-interval of the readings. The sums extend over the readings of a step:
+relative to its mean, m/s; and the north and up components of the field. :math:`R` is the
+orientation integrated from the angular rates with the assumed bias :math:`\hat b`. f is the
+specific force, and T the interval of the readings. The sums extend over the readings of a step:
 
 .. math::
 
@@ -62,9 +62,9 @@ FIELD_LIMIT = 0.1
 LASTING_S = 1.0
 """Correlation time of deviations of velocity and field, s."""
 SCALE_SD = 0.002
-"""Standard deviation of the scale and the axes of a gyroscope, relative."""
+"""Relative standard deviation of the scale and of the axis directions of a gyroscope."""
 FORCE_SD = 0.3
-"""Standard deviation of an accelerometer during motion, m/s^2."""
+"""Standard deviation of the error of an accelerometer during motion, m/s^2."""
 REVERSAL_S = 0.3
 """Time after which a movement reverses, s. It is the correlation time of the errors with the
 standard deviations `SCALE_SD` and `FORCE_SD`."""
@@ -91,7 +91,7 @@ class StartReading(NamedTuple):
     force: Vector
     """Specific force, m/s^2."""
     field: Vector
-    """Magnetic field; zeros if the reading has none."""
+    """Magnetic field; zeros if the reading has no field."""
 
 
 class StartEstimator:
@@ -139,7 +139,8 @@ class StartEstimator:
         self.q_world_gyro = multiply_one((cos(half), 0.0, 0.0, sin(half)), self.q_world_gyro)
         self._field = np.array((np.hypot(east, north), up_part))
 
-        # The second pass uses the speed of the sensor that the first pass estimated.
+        # The filter runs twice. The second pass uses the standard deviation of the velocity that
+        # the first pass estimated.
         begins = range(0, len(readings) - self._step + 1, self._step)
         parts = [readings[begin : begin + self._step] for begin in begins]
         start = (self.q_world_gyro, self._field)
@@ -169,7 +170,7 @@ class StartEstimator:
 
     @property
     def speed_sd(self) -> float:
-        """Standard deviation of the velocity about its mean, m/s."""
+        """Standard deviation of the velocity about its mean, per axis, m/s."""
         return sqrt(self._squared / self._observed_s)
 
     @property

@@ -1,8 +1,8 @@
 """Detection of losses in a stream without time and counter, from the arrival times alone.
 
-A lost frame delays all later arrivals permanently by a whole period. A busy bus or host delays some
-arrivals temporarily. The smallest delay of every ten samples, relative to a straight line with the
-nominal rate, distinguishes the two cases.
+The delay of a sample is its arrival minus the arrival expected from the nominal rate. A lost sample
+increases the delays of all later samples by a whole period. A busy bus or host increases the delays
+of only some samples. The smallest delay of every ten samples distinguishes the two cases.
 
 Invariant: the result depends only on the arrival stamps.
 """
@@ -18,7 +18,7 @@ _SAMPLES = 10
 _LOST = 0.75
 """Increase of the smallest delay that proves a loss, periods."""
 _DRIFT = 0.1
-"""Largest increase of the smallest delay that a difference of the two clocks can cause, periods."""
+"""Largest increase of the smallest delay, per window, that the skew of a clock causes, periods."""
 _WRONG_RATE = 0.2
 """Smallest relative difference between mean and nominal interval at which the rate counts as
 wrong."""
@@ -30,9 +30,9 @@ class ArrivalStep(NamedTuple):
     """Result of adding one sample."""
 
     lost: int = 0
-    """Number of lost samples."""
+    """Number of samples lost before this sample."""
     rate_hz: float | None = None
-    """Measured rate, Hz, if it differs from the nominal rate; it is reported once."""
+    """Measured rate, Hz, at the time when an unexpected rate is detected; None otherwise."""
 
 
 _CONTINUES = ArrivalStep()
@@ -56,7 +56,7 @@ class ArrivalGaps:
         self._since_ns = 0
 
     def add(self, t_ns: int) -> ArrivalStep:
-        """Add a sample that arrived at `t_ns`."""
+        """Add a sample that arrived at `t_ns`; return the losses and the rate that it shows."""
         if self._due_ns is None:
             self._due_ns, self._since_ns = float(t_ns), t_ns
             self._least_ns = 0.0

@@ -3,8 +3,8 @@
 The sensor sends no time and no sequence number. The stamp of a sample is the arrival of its first
 frame, and losses are detected from the arrivals.
 
-A record of 24 bytes is a message of this sensor, a frame of another device, a note of the host, or
-a rejected record.
+A chunk contains records of 24 bytes. A record contains a CAN frame, an error frame of the
+controller, or the number of frames or bytes that this host lost.
 
 Invariant: the output depends only on the chunks fed. The decoder reads no clock and no bus.
 """
@@ -76,7 +76,7 @@ class LpmsCanDecoder:
 
     @property
     def discarded_bytes(self) -> int:
-        """Number of bytes in rejected records, and on an adapter's line that formed no frame."""
+        """Number of bytes in rejected records, plus adapter bytes that formed no frame."""
         return self._bus.discarded_bytes
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
@@ -87,7 +87,7 @@ class LpmsCanDecoder:
                 out.append(self._bus.discard(item.discarded, item.reason))
             elif item.error:
                 if item.can_id in {can.HOST_CORRUPT, can.HOST_DROPPED}:
-                    # Frames may be missing here, so the halves before and after may belong to
+                    # Frames may be missing here, so the frames before and after may belong to
                     # different samples.
                     out += self.flush()
                 out += self._bus.add_error_frame(item)
@@ -105,7 +105,7 @@ class LpmsCanDecoder:
         return out
 
     def flush(self) -> list[Decoded]:
-        """Discard an incomplete quaternion."""
+        """Discard an incomplete quaternion, and return the events that result."""
         self._codec.flush()
         out: list[Decoded] = []
         self._report_incomplete(out)
@@ -116,8 +116,8 @@ class LpmsCanDecoder:
         step = self._gaps.add(quaternion.t_ns)
         if step.rate_hz is not None:
             text = (
-                f"sends at {step.rate_hz:.4g} Hz, expected {self._rate_hz:g}: set `rate_hz`, or "
-                "change the rate of the sensor with LpmsControl"
+                f"the sensor sends at {step.rate_hz:.4g} Hz, expected {self._rate_hz:g}: set "
+                "`rate_hz`, or change the rate of the sensor with LpmsControl"
             )
             out.append(DeviceEvent("warning", text, {"rate_hz": round(step.rate_hz, 2)}))
         if step.lost:
@@ -150,13 +150,13 @@ class LpmsCanDecoder:
             out.append(DeviceEvent("restart", "device restarted (its heartbeat reports a start)"))
         elif beat.state != OPERATIONAL:
             text = (
-                f"its heartbeat reports state {beat.state}, expected {OPERATIONAL} (operational): "
-                "switch its CAN output on with LpmsControl"
+                f"the heartbeat of the sensor reports state {beat.state}, expected {OPERATIONAL} "
+                "(operational): switch its CAN output on with LpmsControl"
             )
             out.append(DeviceEvent("warning", text, {"state": beat.state}))
 
     def _report_incomplete(self, out: list[Decoded]) -> None:
-        """Append an event if frames were discarded because their quaternion is incomplete."""
+        """Append events if the codec discarded frames because their quaternion is incomplete."""
         count = self._codec.incomplete - self._incomplete
         self._incomplete += count
         if not count:
@@ -164,7 +164,7 @@ class LpmsCanDecoder:
         self._refused += count
         out.append(
             self._bus.discard(
-                count * can.RECORD_BYTES, "frame without the others of its sample", rejected=count
+                count * can.RECORD_BYTES, "frame of an incomplete quaternion", rejected=count
             )
         )
 

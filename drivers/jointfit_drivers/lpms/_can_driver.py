@@ -34,7 +34,7 @@ _LEAST = 1e-12
 
 
 class LpmsCanImu:
-    """LPMS sensor on a CAN bus: orientation in one or two frames, without time."""
+    """LPMS sensor on a CAN bus, which sends an orientation in one or more frames, without time."""
 
     Settings: ClassVar[type[LpmsCanSettings]] = LpmsCanSettings
     wire: ClassVar[Wire] = "can"
@@ -73,7 +73,7 @@ class LpmsCanImu:
         return LpmsCanDecoder(self._settings)
 
     async def run(self, emit: Emit) -> None:
-        """Read the bus until cancelled.
+        """Emit the frames of the sensor until cancelled.
 
         Raises
         ------

@@ -57,8 +57,9 @@ class LpBusConversation(SerialConversation[LpBusMessage]):
     async def enter_command_mode(self, *, tries: int = 3, wait_s: float | None = None) -> bool:
         """Stop the stream, and return whether the sensor replied.
 
-        Old firmware does not acknowledge this command. In this case the sensor receives a read
-        command that exists in both generations. A reply shows that it is in command mode.
+        Old firmware does not acknowledge this command. Without an acknowledgement, the driver sends
+        a read command that exists in both generations. A reply shows that the sensor is in command
+        mode.
 
         Parameters
         ----------
@@ -76,7 +77,7 @@ class LpBusConversation(SerialConversation[LpBusMessage]):
         return await self._exchange(LpmsCommand.IDENTIFY, replies, wait_s=wait_s) is not None
 
     async def read(self, command: int) -> bytes | None:
-        """Return the data of the reply to a read command; None if it is refused or unanswered."""
+        """Return the data of the reply to a read command; None if the sensor sends no data."""
         for _ in range(2):
             reply = await self._exchange(command, {command, LpmsCommand.NACK})
             if reply is not None:
@@ -91,7 +92,7 @@ class LpBusConversation(SerialConversation[LpBusMessage]):
         return None if reply is None else reply.command == LpmsCommand.ACK
 
     async def start_stream(self) -> bool | None:
-        """Start the stream; return whether the sensor accepted it, or None without any reply."""
+        """Start the stream; return whether the sensor accepts this, or None without any reply."""
         for _ in range(3):
             replies = _ACKNOWLEDGEMENTS | {LpmsCommand.DATA}
             reply = await self._exchange(LpmsCommand.STREAM_MODE, replies)
@@ -106,7 +107,7 @@ class LpBusConversation(SerialConversation[LpBusMessage]):
     async def _exchange(
         self, command: int, replies: Collection[int], data: bytes = b"", *, wait_s: float = REPLY_S
     ) -> LpBusMessage | None:
-        """Send a command and return the first message with one of `replies`."""
+        """Send a command; return the first message whose command is in `replies`, or None."""
         await self.send(encode(command, data, self._sensor_id))
         return await self._wait_for(replies, wait_s)
 

@@ -1,8 +1,8 @@
 """Decoder of LPMS sensors on a serial line: converts chunks to samples.
 
 A data packet does not state which outputs it contains. The driver reads the mask of outputs before
-the stream begins. The reply is part of the recorded bytes, and the decoder takes the mask from it.
-Without a reply, the decoder finds the quaternion by its norm.
+the stream begins. The reply is part of the recorded bytes, and the decoder takes the mask from this
+reply. Without a reply, the decoder finds the quaternion by its norm.
 
 Invariant: the output depends only on the chunks fed. The decoder reads no clock and no port.
 """
@@ -46,7 +46,7 @@ _SECONDS_CLOCK = TickClock(1_000, None)
 _MOST_SECONDS = 1e9
 _DATA = int(LpmsCommand.DATA)
 _TEXT_BYTES = 256
-"""Number of bytes without a message after which they are checked for text."""
+"""Number of bytes without a message after which the bytes are checked for text."""
 _HALF = TICK_MODULUS // 2
 
 
@@ -106,7 +106,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
         out: list[Decoded] = []
         self._noise += chunk.data[:_TEXT_BYTES]
         if len(self._noise) >= _TEXT_BYTES and is_text(self._noise):
-            out.append(DeviceEvent("warning", f"it sends text: {TEXT_REMEDY}"))
+            out.append(DeviceEvent("warning", f"the sensor sends text: {TEXT_REMEDY}"))
         return out + super().feed(chunk)
 
     @override
@@ -130,14 +130,14 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
         return out
 
     def _decode_packets(self, ready: list[ArrivedPacket]) -> list[Decoded]:
-        """Return the content of packets whose outputs the search determined."""
+        """Return the samples and events of packets whose outputs the search determined."""
         if ready:
             self._layout = self._search.layout
         out, self._search.events = self._search.events, []
         return out + [event for packet in ready for event in self._decode_packet(packet)]
 
     def _decode_packet(self, arrived: ArrivedPacket) -> list[Decoded]:
-        """Check the time of a data packet, and return the packet's content."""
+        """Check the time of a data packet; return the samples and events that it completes."""
         message, arrival_ns = arrived
         measurement = self._layout.decode(message.data)
         if measurement is None or "quaternion" not in self._layout.places:
@@ -149,7 +149,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
         if message.sensor_id != self._sensor_id and not self._id_reported:
             self._id_reported = True
             found, wanted = message.sensor_id, self._sensor_id
-            text = f"sends as sensor id {found}, expected {wanted}: set `sensor_id`"
+            text = f"the sensor has sensor id {found}, expected {wanted}: set `sensor_id`"
             out.append(DeviceEvent("warning", text, {"sensor_id": found}))
 
         ticks = self._device_ticks(measurement.tick)
@@ -179,7 +179,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
         return out + self._sample(packet)
 
     def _device_ticks(self, tick: int) -> int | None:
-        """Return the device time in ticks of `tick_clock`, without wraps; None if there is none."""
+        """Return the device time in ticks of `tick_clock`, without wraps; None if it is invalid."""
         if self._is_seconds:
             seconds = seconds_of(tick)
             is_time = isfinite(seconds) and 0 <= seconds < _MOST_SECONDS
@@ -251,7 +251,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
         if fault.is_seconds:
             text = 'device time is float seconds, not ticks: set device_time = "seconds"'
         elif self._is_seconds:
-            text = 'device time is no float seconds: set device_time = "ticks"'
+            text = 'device time is not float seconds: set device_time = "ticks"'
         else:
             hz = fault.usual_hz
             remedy = f"set tick_hz = {hz}" if hz else "set `tick_hz`, and check `rate_hz`"
@@ -262,21 +262,21 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
         return [DeviceEvent("warning", text, {"ticks_per_s": round(fault.ticks_per_s, 1)})]
 
     def _length_warning(self, message: LpBusMessage) -> list[Decoded]:
-        """Return a warning, once per length, if the length of packets does not fit the outputs."""
+        """Return a warning, once per length, because the packet length does not fit the outputs."""
         size = len(message.data)
         if size in self._sizes:
             return []
         self._sizes.add(size)
         floats, shorts = self._layout.sizes
         names = " + ".join(self._layout.places) or "no output"
-        cause = "its outputs were changed, or its firmware is newer than this version"
+        cause = "the outputs were changed, or the firmware is newer than jointfitd"
         if self._configuration.outputs is None:
             cause = (
-                "no reply of the sensor names its outputs, and no quaternion was found by its norm"
+                "no reply of the sensor names the outputs, and no quaternion was found by its norm"
             )
         text = (
-            f"data packets of {size} bytes, expected {floats} (32 bit) or {shorts} (16 bit) of "
-            f"{names}: {cause}: let the driver connect again, or enable the quaternion alone"
+            f"data packets have {size} bytes, expected {floats} (32 bit) or {shorts} (16 bit) for "
+            f"{names}; {cause}: let the driver connect again, or enable only the quaternion"
         )
         return [DeviceEvent("warning", text, {"data_bytes": size})]
 
@@ -291,7 +291,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
 
 def is_text(data: bytes) -> bool:
     """Return whether `data` are lines of printable ASCII, like the text format of a sensor."""
-    printable = sum(0x20 <= byte < 0x7F or byte in b"\r\n\t" for byte in data)  # noqa: PLR2004 - a generation, or ASCII
+    printable = sum(0x20 <= byte < 0x7F or byte in b"\r\n\t" for byte in data)  # noqa: PLR2004 - ASCII
     return bool(data) and printable >= _TEXT_SHARE * len(data)
 
 

@@ -42,8 +42,8 @@ class LpmsImu:
             The port is absent, in use, unplugged, or silent for ``lost_after_s``. A retry may
             succeed.
         DeviceMisconfiguredError
-            The file is not a serial port, or no LPMS sensor answers. Or the sensor has another
-            speed, generation or address, or does not accept the settings.
+            The file is not a serial port, no LPMS sensor answers, the sensor has another speed,
+            generation or address, or it does not accept the settings.
         """
         settings = self._settings
         await self._reception.run(

@@ -1,8 +1,8 @@
 """Start of an LPMS sensor: the driver makes it stream, or raises an error with the cause.
 
-The driver reads the settings of the sensor and writes only settings that differ. It then reads them
-again, because old firmware acknowledges nothing. The sensor stores the settings in flash only with
-``persist``.
+The driver reads the settings of the sensor and writes only settings that differ from rig.toml. It
+then reads them again, because old firmware acknowledges nothing. The sensor stores the settings in
+flash only with ``persist``.
 
 Some commands have a different meaning in the other generation of sensors. Before the first such
 command, the driver sends a query that has no effect in either generation. The reply shows the
@@ -37,14 +37,14 @@ log = logging.getLogger(__name__)
 LINE_SPEEDS = (115_200, 921_600, 460_800, 230_400, 57_600, 38_400, 19_200, 9_600)
 """Line speeds for the search, bit/s: factory settings and usual speeds first."""
 _LISTEN_S = 0.15
-"""Duration of the search at each speed, s."""
+"""Longest wait for an answer at each speed, s."""
 _QUIET_S = 1.2
-"""If no byte arrives for this time, the earlier bytes were noise, s. Devices of other kinds may
-send only once a second."""
+"""Silence, s, after which the earlier bytes count as noise. Devices of other kinds may send only
+once a second."""
 _STORE_S = 3.0
 """Longest wait for the acknowledgement of a flash write, s."""
 _FIRST_S, _FIRST_PERIODS = 1.0, 5
-"""Longest wait for the first data packet: in seconds, and in periods of a slow sensor."""
+"""Longest wait for the first data packet: the longer of a time, s, and a number of periods."""
 
 
 class LpmsHandshake:
@@ -57,7 +57,7 @@ class LpmsHandshake:
     settings : LpmsSettings
         Table of the device in rig.toml.
     hunt : bool
-        Whether to search for a silent sensor at other speeds. If the sensor's bytes cannot be
+        Whether to search at other speeds if no byte arrived. If bytes arrived that cannot be
         decoded, the other speeds are always searched.
     """
 
@@ -79,8 +79,8 @@ class LpmsHandshake:
         DeviceLostError
             The sensor does not answer, was unplugged, or stopped answering.
         DeviceMisconfiguredError
-            Speed, generation or address differ from the settings. Or the device is of another kind,
-            or does not accept the settings.
+            The speed, generation or address differs from the settings, the device is of another
+            kind, or it does not accept the settings.
         """
         settings = self._settings
         settings.require_line_speed("the speed of the sensor")
@@ -99,15 +99,15 @@ class LpmsHandshake:
         found = None if reply is None else identify_generation(reply)
         if found is None:
             log.warning(
-                "%s: does not identify its generation; using generation = %d as configured",
+                "%s: the sensor does not report its generation; using generation = %d",
                 self._settings.id,
                 self._table.generation,
             )
         elif found != self._table.generation:
             raise DeviceMisconfiguredError(
-                f"{self._path}: a sensor of generation {found} ({TABLES[found].models}), expected "
-                f"generation {self._table.generation}: set generation = {found}. Nothing was "
-                "written: the commands of one generation erase settings of the other"
+                f"{self._path}: the sensor has generation {found} ({TABLES[found].models}), "
+                f"expected generation {self._table.generation}: set generation = {found}. Nothing "
+                "was written: the commands of one generation erase settings of the other"
             )
 
     async def _ensure_configuration(self) -> None:
@@ -124,18 +124,18 @@ class LpmsHandshake:
         for command, data in set_command(self._table, part):
             if await self._conversation.write(command, data) is False:
                 raise DeviceMisconfiguredError(
-                    f"{self._path}: refuses {self._describe(part)} (command 0x{command:02X}): "
-                    "change `rate_hz` or `precision`, or update its firmware"
+                    f"{self._path}: the sensor refuses {self._describe(part)} (command "
+                    f"0x{command:02X}): change `rate_hz` or `precision`, or update the firmware"
                 )
 
         left = _differing(await self._read_configuration(), wanted)
         if left.outputs is not None or left.rate_hz is not None:
             raise DeviceMisconfiguredError(
-                f"{self._path}: does not accept {self._describe(left)}: change `rate_hz`, or "
-                "update its firmware"
+                f"{self._path}: the sensor does not accept {self._describe(left)}: change "
+                "`rate_hz`, or update the firmware"
             )
         if settings.persist:
-            log.warning("%s: storing its settings in flash", settings.id)
+            log.warning("%s: storing the settings in the flash of the sensor", settings.id)
             await self._conversation.write(self._table.store, wait_s=_STORE_S)
 
     async def _read_configuration(self) -> LpmsConfiguration:
@@ -148,7 +148,7 @@ class LpmsHandshake:
                 found = found.merge(part)
         if found.outputs is None or found.rate_hz is None:
             raise DeviceLostError(
-                f"{self._path}: does not answer the read commands of generation "
+                f"{self._path}: the sensor does not answer the read commands of generation "
                 f"{self._table.generation}: check `generation` and the wire from host to sensor"
             )
         return found
@@ -171,16 +171,17 @@ class LpmsHandshake:
             raise self._settings.stopped_answering()
         if not started:
             raise DeviceMisconfiguredError(
-                f"{self._path}: refuses to stream: change `rate_hz` or `baud`"
+                f"{self._path}: the sensor refuses to stream: change `rate_hz` or `baud`"
             )
         self._conversation.last_bytes = b""
         wait_s = max(_FIRST_S, _FIRST_PERIODS / self._settings.rate_hz)
         if await self._conversation.wait_for_data(wait_s):
             return
         if is_text(self._conversation.last_bytes):
-            raise DeviceMisconfiguredError(f"{self._path}: sends text: {TEXT_REMEDY}")
+            raise DeviceMisconfiguredError(f"{self._path}: the sensor sends text: {TEXT_REMEDY}")
         raise DeviceLostError(
-            f"{self._path}: accepts the settings but sends no data: check it with LpmsControl"
+            f"{self._path}: the sensor accepts the settings but sends no data: check the sensor "
+            "with LpmsControl"
         )
 
     async def _explain_silence(self) -> NoReturn:
@@ -189,12 +190,13 @@ class LpmsHandshake:
         others = sorted(conversation.ids - {settings.sensor_id})
         if others:
             raise DeviceMisconfiguredError(
-                f"{self._path}: sends as sensor id {others[0]}, expected {settings.sensor_id}: set "
-                f"sensor_id = {others[0]}"
+                f"{self._path}: the sensor has sensor id {others[0]}, expected "
+                f"{settings.sensor_id}: set sensor_id = {others[0]}"
             )
         if conversation.ids:
             raise DeviceLostError(
-                f"{self._path}: streams but does not answer: check the wire from host to sensor"
+                f"{self._path}: the sensor streams but does not answer: check the wire from host "
+                "to sensor"
             )
         received, sends_text = conversation.received, is_text(conversation.last_bytes)
 
@@ -206,13 +208,13 @@ class LpmsHandshake:
             )
         if not received:
             raise DeviceLostError(
-                f"{self._path}: silent: check its power, and that TX and RX are not swapped. A "
-                "sensor of generation 1 that was put to sleep needs a power cycle"
+                f"{self._path}: the sensor is silent: check its power, and that TX and RX are not "
+                "swapped. A sensor of generation 1 that was put to sleep needs a power cycle"
             )
         if sends_text:
             raise DeviceMisconfiguredError(
-                f"{self._path}: sends text: correct `port` or `driver`, or, if it is an LPMS "
-                f"sensor, {TEXT_REMEDY}"
+                f"{self._path}: the device sends text: correct `port` or `driver`, or, if it is an "
+                f"LPMS sensor, {TEXT_REMEDY}"
             )
 
         self._port.set_baud(settings.baud)
@@ -224,13 +226,13 @@ class LpmsHandshake:
                 "`port`"
             )
         raise DeviceMisconfiguredError(
-            f"{self._path}: the device on this port is not LPMS: it sends bytes, none of them "
-            "LP-BUS at any common speed: correct `port` or `driver`, which "
-            "`jointfit probe` recognizes"
+            f"{self._path}: the device on this port is not LPMS: it sends bytes, but no LP-BUS "
+            "message at any common speed: correct `port` or `driver`; `jointfit probe` recognizes "
+            "the device on a port"
         )
 
     async def _other_speed(self) -> int | None:
-        """Return the speed at which the sensor answers; the sensor then continues to stream."""
+        """Return the speed, bit/s, at which the sensor answers; it then continues to stream."""
 
         async def answers() -> bool:
             entered = await self._conversation.enter_command_mode(tries=1, wait_s=_LISTEN_S)
@@ -244,7 +246,7 @@ class LpmsHandshake:
 
 
 def _differing(found: LpmsConfiguration, wanted: LpmsConfiguration) -> LpmsConfiguration:
-    """Return the settings of `wanted` that differ from `found` or are unknown in it."""
+    """Return the settings of `wanted` that differ in `found` or are unknown in `found`."""
     return LpmsConfiguration(
         wanted.outputs if found.outputs != wanted.outputs else None,
         wanted.rate_hz if found.rate_hz != wanted.rate_hz else None,

@@ -69,7 +69,10 @@ class LpmsOrientation:
     def convert(
         self, values: Sequence[float], *, floats: bool
     ) -> tuple[Quaternion, Quaternion] | None:
-        """Return the scaled and the canonical quaternion; None if the norm is not 1."""
+        """Return the scaled and the canonical quaternion; None if the norm is not 1.
+
+        `floats` states whether `values` are floats; otherwise they are 16-bit integers.
+        """
         a, b, c, d = values
         if not floats:
             unit = self._scale.feed(values)
@@ -90,7 +93,7 @@ class LpmsOrientation:
         return None if q is None else (native, q)
 
     def forget(self) -> None:
-        """Restart the continuity of signs, because the device restarted."""
+        """Forget the sign of the last quaternion, because the device restarted."""
         self._gate.forget()
 
     def _check_norm(self, square: float) -> None:

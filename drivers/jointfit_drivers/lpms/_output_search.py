@@ -1,7 +1,7 @@
-"""Place of the quaternion in data packets whose outputs are unknown.
+"""Search for the place of the quaternion in data packets whose outputs are unknown.
 
-A data packet does not name its outputs. If a capture lacks the replies to the driver's requests, or
-if it was recorded while another program used the sensor, only the length of the packets is known.
+A data packet does not name its outputs. If a recording lacks the replies to the driver's requests,
+or if it was made while another program used the sensor, only the length of the packets is known.
 The outputs have a fixed order, so few places are possible for the quaternion. The norm of the
 quaternion is 1 in every packet. The norm of an acceleration at rest may also be 1, but with a
 larger deviation.
@@ -29,8 +29,8 @@ _EXAMINED = (4, 16, 32, 64, 128, 256)
 """Numbers of stored packets at which the places are examined. They grow geometrically, so that the
 total time is proportional to the number of packets."""
 _DECIDING, _MOST_HELD = _EXAMINED[1], _EXAMINED[-1]
-"""Number of packets at which a search ends if only one place is possible, and number at which it
-ends in any case."""
+"""Number of packets at which a search ends if only one place is possible, and number of packets at
+which it always ends."""
 _TOLERANCE = 0.01
 """Largest deviation of the norm from 1."""
 _CLEARER = 5.0
@@ -63,7 +63,7 @@ class OutputSearch:
         """Layout of the packets. Until another layout is found, packets are assumed to contain
         only the quaternion."""
         self._candidates: dict[int, list[PacketLayout]] = {}
-        self._size: int | None = None  # of the packets that `layout` describes
+        self._size: int | None = None  # of the packets that `layout` describes, bytes
         self._held: list[ArrivedPacket] = []
         self.events: list[Decoded] = []
         """Events that were not returned yet."""
@@ -89,12 +89,12 @@ class OutputSearch:
         return ready
 
     def flush(self) -> list[ArrivedPacket]:
-        """End the search: return the stored packets."""
+        """End the search, set `layout`, and return the stored packets."""
         found = self._find() if self._held else []
         return self._end(found[0] if len(found) == 1 else self._alone) if self._held else []
 
     def release(self) -> list[ArrivedPacket]:
-        """Return the stored packets without a search; called when a reply has named the outputs."""
+        """Return the stored packets without a search, after a reply has named the outputs."""
         ready, self._held = self._held, []
         return ready
 
@@ -105,7 +105,7 @@ class OutputSearch:
             place = layout.places["quaternion"]
             precision = "float32" if self._size == layout.sizes[0] else "int16"
             text = (
-                f"its outputs are unknown, because it sent no reply with its settings: values "
+                "the outputs are unknown, because the sensor did not report its settings: values "
                 f"{place.start + 1} to {place.stop} of {layout.values} ({precision}) "
                 "have norm 1 and are used as the quaternion"
             )
@@ -114,7 +114,7 @@ class OutputSearch:
         return ready
 
     def _find(self) -> list[PacketLayout]:
-        """Return the layouts that fit the stored packets, or only one if it fits clearly best."""
+        """Return the layouts that fit the stored packets, or only the clearly best layout."""
         rated = []
         size = len(self._held[0].message.data)
         if size not in self._candidates:
@@ -155,7 +155,7 @@ def _masks(outputs: Sequence[LpmsOutput]) -> dict[int, int]:
 
 
 def _deviation(layout: PacketLayout, data: bytes) -> float | None:
-    """Return the deviation of the quaternion's norm from 1; None if there is no quaternion."""
+    """Return the deviation of the quaternion's norm from 1; None if it is too large."""
     measurement = layout.decode(data)
     if measurement is None:
         return None

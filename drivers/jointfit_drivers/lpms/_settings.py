@@ -21,8 +21,8 @@ class LpmsSettings(SerialImuSettings, LpmsConventionSettings):
     """One LP-Research LPMS sensor on a serial port or USB."""
 
     generation: Literal[1, 3] = Field(
-        description="1: B2, CU2, URS2, CURS2, AL2, ME1; 3: LPMS3, IG1, BE1, NAV3. Their commands "
-        "conflict: a read command of one erases the settings of the other",
+        description="1: B2, CU2, URS2, CURS2, AL2, ME1; 3: LPMS3, IG1, BE1, NAV3. A read "
+        "command of one generation erases the settings of the other",
     )
     sensor_id: int = Field(1, ge=0, le=65535, description="address of the sensor in its messages")
     precision: Literal["float32", "int16"] = Field(
@@ -30,8 +30,8 @@ class LpmsSettings(SerialImuSettings, LpmsConventionSettings):
     )
     persist: bool = Field(
         False,
-        description="store changed settings in the sensor's flash; otherwise they last until it "
-        "loses power",
+        description="store changed settings in the sensor's flash; otherwise they last until the "
+        "sensor loses power",
     )
     tick_hz: int | None = Field(
         None,
@@ -69,7 +69,7 @@ class LpmsSettings(SerialImuSettings, LpmsConventionSettings):
 
     @override
     def contradictions(self) -> Iterator[tuple[str, str]]:
-        """Yield rates that the generation does not support, or that its time cannot count."""
+        """Yield a rate that the generation does not support, or that exceeds the tick rate."""
         known: Any = (self.generation, self.rate_hz)  # None: key cannot be read
         if None in known:
             return
@@ -80,6 +80,6 @@ class LpmsSettings(SerialImuSettings, LpmsConventionSettings):
         elif self.rate_hz > self.ticks_per_s:
             yield (
                 "rate_hz",
-                f"{self.rate_hz:g} Hz with {self.ticks_per_s} ticks of device time in a second: "
-                "lower it, or set `tick_hz` to the ticks that the sensor counts",
+                f"{self.rate_hz:g} Hz exceeds {self.ticks_per_s} ticks of device time per second: "
+                "lower `rate_hz`, or set `tick_hz` to the tick rate of the sensor",
             )

@@ -21,8 +21,8 @@ _NEAR = 0.05
 """Largest relative deviation of a measured rate from the rate that it confirms."""
 _MOST_RATIO = 4.0
 """Largest ratio of a measured rate to the configured rate, or the reverse, at which an unusual rate
-is reported. In a file of raw bytes, the stamps are not arrival times and are closer together, so
-the ratio is larger."""
+is reported. If a file of raw bytes is decoded, its stamps are closer together than arrival times,
+so the ratio is larger."""
 _USUAL_HZ = (400, 500, 800, 1000)
 
 
@@ -32,7 +32,7 @@ class TimeUnitFault(NamedTuple):
     ticks_per_s: float
     """Measured rate of the number that the device sends, 1/s."""
     usual_hz: int | None
-    """Usual tick rate near the measured rate; None if there is none."""
+    """Usual tick rate near the measured rate; None if no usual rate is near."""
     is_seconds: bool
     """Whether the device sends float32 seconds."""
 
@@ -43,7 +43,7 @@ class TickRateCheck:
     Parameters
     ----------
     ticks_per_s : int
-        Configured tick rate, 1/s; 1 for seconds.
+        Configured tick rate, 1/s; not used if `is_seconds` is true.
     is_seconds : bool
         Whether the configured unit is float32 seconds.
     """
@@ -56,7 +56,7 @@ class TickRateCheck:
         """Whether the check has ended, with or without a fault."""
 
     def feed(self, tick: int, arrival_ns: int) -> TimeUnitFault | None:
-        """Add a data packet. Return the fault once, as soon as it is certain.
+        """Add a data packet. Return the fault once, as soon as it is certain, and None otherwise.
 
         Parameters
         ----------
@@ -79,7 +79,7 @@ class TickRateCheck:
             self.done = True
             return None
 
-        # A restart of the device or a pause of this host makes one span wrong.
+        # A restart of the device or a pause of this host causes at most one wrong span.
         self._contradictions += 1
         if self._contradictions < _CONTRADICTIONS:
             return None

@@ -1,15 +1,16 @@
 """Assignment of the channels of an LSL stream to marker coordinates and body poses.
 
-The convention is the MoCap meta-data of XDF, the file format of LSL. Each channel has a label, a
-marker or an object, a type (PositionX to Z, OrientationA to D, or Confidence) and a unit. If the
-type is missing, the end of the label (``T1_X``, ``Thigh.qw``, ``Thigh_quat_w``) replaces it. If the
-channels have no labels, rig.toml defines the labels, or the names of markers with x, y and z each.
+The convention is the MoCap meta-data of XDF, the file format of LSL. Each channel has a label,
+the name of a marker or object, a type (PositionX to Z, OrientationA to D, or Confidence) and a
+unit. If the type is missing, the end of the label (``T1_X``, ``Thigh.qw``, ``Thigh_quat_w``)
+replaces it. If the channels have no labels, rig.toml defines the labels, or the names of the
+markers, each of which has the three channels x, y and z.
 
-The convention does not define which of OrientationA to D is the scalar. PhaseSpace sends it first,
-the OptiTrack program of LSL last.
+The convention does not define which of OrientationA to D is the scalar. PhaseSpace sends the scalar
+first. The OptiTrack program of LSL sends it last.
 
 Invariant: the functions are pure. An unknown channel is ignored and never guessed. If all channels
-are unknown, a warning reports it.
+are unknown, a warning reports this fact.
 """
 
 from __future__ import annotations
@@ -118,8 +119,8 @@ def stream_layout(description: StreamDescription, settings: LslMarkersSettings) 
 
     if incomplete:
         warnings.append(
-            f"{list_names(incomplete, _LISTED)} without all three coordinates: not used; stream x, "
-            "y and z"
+            f"{list_names(incomplete, _LISTED)} without all three coordinates are not used: stream "
+            "x, y and z"
         )
     if turned:
         warnings.append(
@@ -134,7 +135,7 @@ def stream_layout(description: StreamDescription, settings: LslMarkersSettings) 
 
 
 _Found = dict[tuple[str, str, bool], dict[str, int]]
-"""Channel number of each component, by owner, name, and whether the owner is an object."""
+"""Channel number of each component, by owner, name, and whether the name belongs to an object."""
 
 
 def _named_channels(
@@ -175,7 +176,7 @@ def _channels(
 
 
 def _quaternion_order(description: StreamDescription, settings: LslMarkersSettings) -> str:
-    """Return the components of the channels OrientationA to D."""
+    """Return the components in the channels OrientationA to D, in this order."""
     if settings.quaternion_order != "auto":
         return settings.quaternion_order
     return "xyzw" if description.manufacturer.lower() == _LAST_SCALAR else "wxyz"
@@ -214,8 +215,8 @@ def _described_channels(
         )
     if repeated:
         warnings.append(
-            f"{list_names(repeated, _LISTED)} described more than once: the first channel is used; "
-            "give every marker a name of its own in the camera software"
+            f"{list_names(repeated, _LISTED)} are described more than once: the first channel is "
+            "used; give every marker a name of its own in the camera software"
         )
     return found
 
@@ -249,8 +250,8 @@ def _unit(
     lengths = {_UNITS_M[text] for text in texts if text in _UNITS_M}
     if len(lengths) > 1 or (texts - {""} and not lengths):
         warnings.append(
-            f"positions described in {list_names(sorted(texts), _LISTED)}: metres are assumed; set "
-            "unit in [mocap]"
+            f"the stream describes positions in {list_names(sorted(texts), _LISTED)}: metres are "
+            "assumed; set unit in [mocap]"
         )
         return "m"
     return {1.0: "m", 0.01: "cm", 0.001: "mm"}[lengths.pop()] if lengths else "m"

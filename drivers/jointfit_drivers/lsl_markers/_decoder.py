@@ -1,9 +1,10 @@
 """Decoder of LSL streams: converts chunks to optical frames and clock echoes.
 
-A sample of the stream is a frame. A position counts as occluded if a coordinate is not finite, if
-all three coordinates are exactly zero, or if its confidence is zero. Some programs stamp samples
-with the time of their cameras instead of the LSL clock. If the stamps were found to be on the LSL
-clock, each comparison of the LSL clock of the sender with the host clock is returned as an echo.
+Each sample of the stream becomes one frame. A position counts as occluded if a coordinate is not
+finite, if all three coordinates are exactly zero, or if its confidence is not positive. Some
+programs stamp samples with the time of their cameras instead of the LSL clock. The decoder
+therefore checks the stamps. If they are on the LSL clock, each comparison of the sender's LSL clock
+with the host clock is returned as an echo.
 
 Invariant: the output depends only on the chunks fed. The decoder reads no clock and no stream.
 """
@@ -44,8 +45,9 @@ _LATEST_S = 9e9
 _BACKWARDS_NS = NS_PER_S
 """Smallest decrease of the stamps that shows a restart of the sender, ns."""
 _GAP_PERIODS, _LEAST_GAP_NS = 5, 100_000_000
-"""Steps of the stamps of a regular stream, in periods and in ns. If both are exceeded, samples were
-lost. Programs that stamp samples at transmission have a jitter of several periods."""
+"""Largest step between two stamps of a regular stream, in periods and in ns. If a step exceeds both
+values, samples were lost. If a program stamps samples at transmission, the stamps have a jitter of
+several periods."""
 _REPEATED = 50
 """Number of repeated stamps that causes a warning. A stamp is repeated if it equals the stamp of
 the previous sample."""
@@ -95,12 +97,12 @@ class LslMarkersDecoder:
 
     @property
     def discarded_bytes(self) -> int:
-        """Number of bytes so far that belong to no chunk."""
+        """Number of bytes so far in malformed chunks."""
         return self._codec.discarded
 
     @property
     def description(self) -> tuple[bytes, ...]:
-        """Chunk with the newest description of the stream."""
+        """Chunk with the newest description of the stream; empty before the first description."""
         return () if self._described is None else (self._described,)
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
@@ -147,7 +149,7 @@ class LslMarkersDecoder:
                 DeviceEvent(
                     "warning",
                     f"the stream had {before.channel_count} channels and has "
-                    f"{description.channel_count} since it was connected again: check the markers "
+                    f"{description.channel_count} since the new connection: check the markers "
                     "and bodies that the camera software streams",
                     {"before": before.channel_count, "now": description.channel_count},
                 )

@@ -53,7 +53,7 @@ def search_streams(
     query : str
         XPath predicate that selects streams.
     server : str, optional
-        Address or name of the sender. Streams of other senders are ignored.
+        Address or name of the sender. Streams of other senders are ignored. None: all senders.
     least : int
         Number of streams after which the search ends early.
     wait_s : float
@@ -85,7 +85,7 @@ def compare_clocks(lsl: Any, inlet: Any, wait_s: float) -> RoundTrip | None:
     """Return the latest comparison of the sender's clock with CLOCK_MONOTONIC of this host.
 
     liblsl queries the sender every few seconds, and uses the reply with the shortest round-trip
-    time. The uncertainty is that round-trip time. The result is None if no reply arrives within
+    time. The uncertainty is this round-trip time. The result is None if no reply arrives within
     `wait_s`.
     """
     remote, uncertainty, code = ctypes.c_double(), ctypes.c_double(), ctypes.c_int()
@@ -101,7 +101,8 @@ def compare_clocks(lsl: Any, inlet: Any, wait_s: float) -> RoundTrip | None:
     if code.value:
         return None
 
-    # The LSL clock is CLOCK_MONOTONIC in the usual builds on Linux, but the difference is measured.
+    # In the usual builds on Linux, the LSL clock is CLOCK_MONOTONIC. Other builds may have another
+    # clock, so the difference is measured.
     readings = []
     for _ in range(_READINGS):
         before_ns = time.monotonic_ns()

@@ -1,7 +1,7 @@
 """One connection to a stream: search, description, samples, and comparisons of the clocks.
 
-1. The session searches for streams that fit. If there is none, the device is lost. If there are
-several from different sources, the device is misconfigured.
+1. The session searches for streams that fit the settings. If no stream fits, the device counts as
+lost. If streams of several sources fit, the device counts as misconfigured.
 2. It emits the description, then the samples as they arrive. Each emission is one chunk.
 3. A second thread queries the offset of the sender's clock and emits every new result. It is a
 separate thread because the first reply takes half a second.
@@ -50,7 +50,7 @@ _MOST_SAMPLES = 256
 _BUFFER_S = 10
 """Duration of the samples that the library stores while this host does not read, s."""
 _OTHERS = 32
-"""Number of streams after which the search for streams that do not fit ends."""
+"""Number of streams after which the search for all streams, fitting or not, ends."""
 _LISTED = 8
 """Largest number of streams in an error."""
 _FORMATS = dict(enumerate(("", "float32", "double64", "string", "int32", "int16", "int8", "int64")))
@@ -84,8 +84,8 @@ def _other_streams(streams: Sequence[Any]) -> str:
         )
         return f"; the network has {listed}: set stream in [mocap] to the stream of the cameras"
     return (
-        ": start the program that sends it, check the name (`jointfit probe --network` lists "
-        "streams), and that firewalls pass UDP 16571 and TCP 16572 to 16604"
+        ": start the program that sends the stream, check the name (`jointfit probe --network` "
+        "lists streams), and that firewalls pass UDP 16571 and TCP 16572 to 16604"
     )
 
 
@@ -111,7 +111,7 @@ class LslSession:
         self._last_ns = 0
 
     async def run(self) -> None:
-        """Connect and read until cancelled. The errors are those of `LslMarkersMocap.run`."""
+        """Connect and read until cancelled. Raises the same errors as `LslMarkersMocap.run`."""
         lsl = load_library()
         reading = threading.Thread(target=self._read, args=(lsl,), name="lsl reader", daemon=True)
         reading.start()
@@ -230,8 +230,8 @@ class LslSession:
         if kind not in FORMATS:
             raise DeviceMisconfiguredError(
                 f"{self._name}: the values of {info.name()!r} have the format "
-                f"{kind or 'unknown'}, expected numbers: streams of type Markers are texts of "
-                "events; set stream to the stream of the camera software"
+                f"{kind or 'unknown'}, expected numbers: streams of type Markers contain "
+                "texts of events; set stream to the stream of the camera software"
             )
         if info.channel_count() > MOST_CHANNELS:
             raise DeviceMisconfiguredError(
@@ -251,7 +251,7 @@ class LslSession:
             except lsl.util.TimeoutError:
                 if time.monotonic() > until:
                     raise DeviceLostError(
-                        f"{self._name}: was found, but does not answer within {_DESCRIPTION_S:g} s:"
+                        f"{self._name}: the sender does not answer within {_DESCRIPTION_S:g} s:"
                         " check that firewalls pass TCP 16572 to 16604, and start the sender again"
                     ) from None
         return None

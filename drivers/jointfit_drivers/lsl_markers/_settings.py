@@ -56,7 +56,7 @@ class LslMarkersSettings(MocapSettings):
     time: Literal["lsl", "sender"] = Field(
         "lsl",
         description="clock of the time stamps; `lsl`: the LSL clock of the sending PC; `sender`:"
-        " another clock, such as that of the cameras",
+        " another clock, such as the clock of the cameras",
     )
     silence_s: float = Field(5.0, gt=0, description="time without a sample until reconnection, s")
 

@@ -46,7 +46,7 @@ class MipConversation(SerialConversation[MipPacket]):
         tries: int = 3,
         wait_s: float = REPLY_S,
     ) -> MipReply | None:
-        """Send a command until its reply arrives; return None if no reply arrives."""
+        """Send a command, at most `tries` times, and return its reply; None if no reply arrives."""
 
         def is_reply(packet: MipPacket) -> bool:
             known = packet.descriptor_set == command_set

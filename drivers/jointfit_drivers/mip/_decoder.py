@@ -88,7 +88,7 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
         self._other = {int(one): int(field) for one, field in QUATERNIONS.items()}
         del self._other[self._set]
 
-        self._samples = TimedSamples(make_raw, "give the time field the same decimation")
+        self._samples = TimedSamples(make_raw, "give the time field the orientation's decimation")
         super().__init__(MipCodec(), self._samples, baud, MAX_PACKET)
         self._known = known_fields(self._set) or frozenset()
         self._newer = NewerFirmwareDetector(_NEWEST)
@@ -105,7 +105,7 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
         return self._note_other_set(message)
 
     def _decode_data(self, packet: MipPacket) -> list[Decoded]:
-        """Return the content of a packet of the expected data set."""
+        """Return the samples and events of a packet of the configured data set."""
         values: dict[int, tuple[Any, ...]] = {}
         unknown: list[Decoded] = []
         for descriptor, data in packet.fields:
@@ -170,7 +170,7 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
         return out + self._samples.add(reading) if out else self._samples.add(reading)
 
     def _note_validity(self, arrival_ns: int, *, is_valid: bool) -> list[Decoded]:
-        """Return an event if orientations change between valid and invalid."""
+        """Return an event while orientations are invalid, and when they are valid again."""
         since_ns = self._invalid_since_ns
         if is_valid:
             self._invalid_since_ns = None
@@ -191,7 +191,7 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
         return [DeviceEvent("warning", text)]
 
     def _note_other_set(self, packet: MipPacket) -> list[Decoded]:
-        """Return a warning if a packet has an unknown data set, or one that is not configured."""
+        """Return a warning about an unknown data set, or orientations of the other data set."""
         if known_fields(packet.descriptor_set) is None:
             return self._take_unknown("packets", packet)
         field = self._other.get(packet.descriptor_set)
@@ -202,7 +202,7 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
             return []
         name = "sensor" if packet.descriptor_set == DataSet.SENSOR else "filter"
         text = (
-            f"orientations arrive in data set 0x{packet.descriptor_set:02X}, none in "
+            f"orientations arrive in data set 0x{packet.descriptor_set:02X}, but not in "
             f'0x{self._set:02X}: set estimator = "{name}"'
         )
         return [DeviceEvent("warning", text, {"estimator": name})]

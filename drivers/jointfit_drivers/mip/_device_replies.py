@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from jointfit_protocols.mip import MipPacket
 
 _SMALL = 1e-4
-"""Largest vector part of a quaternion that counts as no rotation. It is equal to a rotation by 0.01
-degrees."""
+"""Largest vector component of a quaternion that counts as no rotation. This value is equal to a
+rotation by 0.01 degrees."""
 _FORMATS = {
     Setup.FORMAT_REPLY: None,
     Setup.IMU_FORMAT_REPLY: 0x80,
     Setup.FILTER_FORMAT_REPLY: 0x82,
 }
-"""Data set of each message format; None if the reply itself contains the data set."""
+"""Data set to which each reply refers; None if the reply itself contains the data set."""
 
 
 def reply_events(packet: MipPacket) -> list[Decoded]:
@@ -69,9 +69,9 @@ def _events_of(command_set: int, descriptor: int, data: bytes) -> Iterator[Decod
     yield DeviceEvent("info", f"sensor_to_vehicle {stored}", {"sensor_to_vehicle": stored})
     if not max(map(abs, turn[1:])) <= _SMALL:  # NaN compares false
         text = (
-            f"a sensor-to-vehicle transform is stored (w x y z = {stored}): sensor axes are those "
-            "of the vehicle, not the printed ones. Remove the transform with SensorConnect "
-            "before calibration, or leave it as it is"
+            f"a sensor-to-vehicle transform is stored (w x y z = {stored}): the device sends in "
+            "vehicle axes, not in the axes on its housing. Remove the transform with SensorConnect "
+            "before calibration, or do not change it"
         )
         yield DeviceEvent("warning", text, {"sensor_to_vehicle": stored})
 

@@ -1,10 +1,13 @@
 """Start of a MIP device: the driver makes it stream, or raises an error with the cause.
 
-The driver reads the settings of the device, and writes only settings that differ. Written settings
-are volatile: without ``persist``, the device returns to its stored settings at the next power-up. A
-fault that may end without a change of the settings raises `DeviceLostError`. All other faults raise
-`DeviceMisconfiguredError`. The driver then requests the device to resume. Settings that were
-already written keep their new values until the next power-up.
+The driver reads the settings of the device, and writes only settings that differ from rig.toml.
+Written settings are volatile: without ``persist``, the device returns to its stored settings at the
+next power-up.
+
+A fault that may end without a change of the settings raises `DeviceLostError`. All other faults
+raise `DeviceMisconfiguredError`. If such a fault occurs during the configuration, the driver
+requests the device to resume its stream. Settings that were already written keep their new values
+until the next power-up.
 """
 
 from __future__ import annotations
@@ -54,7 +57,7 @@ class MipHandshake:
     settings : MipSettings
         Table of the device in rig.toml.
     hunt : bool
-        Whether to search for a silent device at other speeds. If the device's bytes cannot be
+        Whether to search at other speeds if no byte arrived. If bytes arrived that cannot be
         decoded, the other speeds are always searched.
     """
 
@@ -104,7 +107,7 @@ class MipHandshake:
         self._refuse(await self._answer(CommandSet.BASE, Base.RESUME), "refuses to resume")
 
     async def _configure(self) -> None:
-        """Write the settings that differ; the device must be idle."""
+        """Write the settings that differ from rig.toml; the device must be idle."""
         reply = await self._answer(CommandSet.BASE, Base.DEVICE_INFO)
         info = commands.decode_info(reply.data(Base.DEVICE_INFO_REPLY))
         if info is not None and info.model_name:
@@ -115,8 +118,8 @@ class MipHandshake:
         fields = self._required.with_time(family)
         self._refuse_missing(fields, supported)
 
-        # The decoder reports a stored transform. Some models do not support this command and refuse
-        # it.
+        # From the reply, the decoder reports a stored transform. Models that do not support this
+        # command refuse it.
         if family == "current":
             await self._answer(CommandSet.SETUP, Setup.TRANSFORM, _READ)
         else:
@@ -148,7 +151,7 @@ class MipHandshake:
         return found
 
     def _family(self, supported: frozenset[int]) -> Family:
-        """Return the family: from the settings, the commands of the device, or its model."""
+        """Return the command family, from the settings, or from the device's commands or model."""
         if self._settings.family != "auto":
             return self._settings.family
         if supported:
@@ -167,7 +170,7 @@ class MipHandshake:
         )
 
     def _alternatives(self) -> str:
-        """Return the settings that require other fields, for the error message."""
+        """Return alternative settings, which require other fields, for the error message."""
         settings = self._settings
         if settings.orientation == "gateway":
             return "magnetometer = false" if settings.magnetometer else 'orientation = "device"'
@@ -177,7 +180,7 @@ class MipHandshake:
     async def _outputs(
         self, stream: StreamCommands, fields: tuple[int, ...]
     ) -> tuple[FormatEntry, ...]:
-        """Return the required message format at the requested rate."""
+        """Return the message format with the required fields at the configured rate."""
         reply = await self._answer(CommandSet.SETUP, stream.base_rate, stream.prefix)
         self._refuse(reply, "does not report its base rate", self._alternatives())
         base_hz = commands.decode_rate(stream.prefix, reply.data(stream.base_rate_reply))
@@ -193,14 +196,14 @@ class MipHandshake:
     async def _ensure_format(self, stream: StreamCommands, wanted: tuple[FormatEntry, ...]) -> bool:
         """Make the device send the fields `wanted`; return whether the format was written.
 
-        A format with further fields is not written again. A written format contains only the fields
-        `wanted`.
+        If the device sends `wanted` and further fields, the format is not written. A written format
+        contains only `wanted`.
         """
         found = await self._format(stream)
         if set(wanted) <= set(found):
             return False
         log.warning(
-            "%s: writing its message format of set 0x%02X: %s instead of %s",
+            "%s: writing the message format of data set 0x%02X: %s instead of %s",
             self._settings.id,
             self._required.data_set,
             _describe(wanted),
@@ -232,7 +235,7 @@ class MipHandshake:
         reply = await self._answer(CommandSet.SETUP, Setup.STREAM, _READ + selector)
         if reply.data(Setup.STREAM_REPLY) == selector + b"\x01":
             return False
-        log.warning("%s: switching its stream on", self._settings.id)
+        log.warning("%s: switching the stream of the device on", self._settings.id)
         data = bytes((Function.WRITE,)) + selector + b"\x01"
         reply = await self._answer(CommandSet.SETUP, Setup.STREAM, data)
         self._refuse(reply, "refuses to stream", self._alternatives())

@@ -1,8 +1,7 @@
-"""Fields that a MIP device must send, which depend on the source of the orientation.
+"""Fields that a MIP device must send. They depend on the source of the orientation.
 
-All fields, including the time, belong to one data set and need the same decimation. The device has
-a separate decimation for each field, so otherwise a packet could contain an orientation without
-time.
+All fields, including the time, belong to one data set and need the same decimation. With different
+decimations, a packet could contain an orientation without time.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ class RequiredFields(NamedTuple):
 
     @property
     def packet_bytes(self) -> int:
-        """Size of the smallest sufficient packet, bytes, of legacy devices; others send less."""
+        """Bytes of a packet with the required fields from a legacy device; others send less."""
         fields = self.with_time("legacy")
         return _FRAME_BYTES + sum(field_bytes(self.data_set, field) for field in fields)
 

@@ -27,8 +27,8 @@ class MipSettings(GatewaySettings, SerialImuSettings):
     )
     persist: bool = Field(
         False,
-        description="save changed settings in the device; otherwise they last until it is "
-        "switched off, and are sent again at the next start",
+        description="save changed settings in the device; otherwise they last until the device "
+        "is switched off, and are sent again at the next start",
     )
 
     @property

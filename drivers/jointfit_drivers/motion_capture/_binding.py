@@ -66,7 +66,7 @@ class ModelEntry(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ColumnBinding:
-    """Columns of the frames. They are valid until the model changes."""
+    """Columns of the frames, valid until the server's model changes."""
 
     layout: MocapLayout
     markers: tuple[ColumnKey, ...]

@@ -1,4 +1,4 @@
-"""Detection of lost, repeated, late and restarted frames of one server by number and stamp.
+"""Detection of lost, repeated and late frames, and of restarts, by frame number and stamp.
 
 Invariant: the module is pure. A step of the frame number that no camera system can reach is a
 restart, never a loss.
@@ -12,13 +12,13 @@ _REORDERED = 100
 """Largest decrease of the number of a reordered datagram. A larger decrease is a restart of the
 server or of a recording that is played in a loop."""
 _FASTEST_HZ = 2000
-"""Upper limit of the frame rate of camera systems, Hz. If the number increases faster, frames were
-not lost, but the server restarted."""
+"""Upper limit of the frame rate of camera systems, Hz. If the number increases faster, the
+server restarted."""
 _BURST = 2000
 """Largest number of frames that may arrive at once, from a queue that was emptied."""
 _LATE_RUN = 10
-"""Number of consecutive frames with a decreased number after which they count as a short recording
-in a loop, not as reordered datagrams."""
+"""Number of consecutive frames with a decreased number from which the frames count as a short
+recording in a loop, not as reordered datagrams."""
 
 
 class FrameStep(NamedTuple):

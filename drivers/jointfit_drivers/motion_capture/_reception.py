@@ -81,7 +81,7 @@ class Reception:
         self.events: list[DeviceEvent] = []
         self.frames: list[MocapFrame] = []
         self.failure: DeviceLostError | DeviceMisconfiguredError | None = None
-        """Error that ended the connection; None if there was none."""
+        """Error that ended the connection; None if no error occurred."""
 
     @property
     def warnings(self) -> list[str]:
@@ -91,7 +91,7 @@ class Reception:
 
     @property
     def facts(self) -> dict[str, object]:
-        """Facts that describe the server."""
+        """Data of all events of the kind ``info``. They describe the server."""
         found: dict[str, object] = {}
         for event in self.events:
             found |= event.data if event.kind == "info" else {}
@@ -138,7 +138,7 @@ def content_findings(
         text = "the stream has no rigid body and no labeled marker"
         findings.append(Finding(CHECK, name, "error", text, remedy))
     if not frames[-1].live:
-        text = "the frames are those of a recording, not of the cameras"
+        text = "the frames come from a recording, not from the cameras"
         findings.append(Finding(CHECK, name, "warning", text, "switch to live measurement"))
 
     findings += tracking_findings(settings, frames, name, "check its definition")
@@ -168,7 +168,7 @@ def tracking_findings(
             column = bodies.index(body)
             if all(np.isnan(frame.body_positions[column]).any() for frame in frames):
                 text = f"rigid body {body!r} of {segment} was not tracked in {len(frames)} frames"
-                view = f"put it in view of the cameras, and {remedy}"
+                view = f"put the body in view of the cameras, and {remedy}"
                 findings.append(Finding(CHECK, name, "warning", text, view))
     return findings
 

@@ -44,7 +44,7 @@ async def find_route(kind: str, settings: ServerSettings) -> Route:
     Parameters
     ----------
     kind : str
-        Name of the device family for messages, such as ``NatNet``.
+        Name of the device family for error messages, such as ``NatNet``.
     settings : ServerSettings
         The ``[mocap]`` table.
 
@@ -73,5 +73,5 @@ async def find_route(kind: str, settings: ServerSettings) -> Route:
             ) from error
         raise DeviceMisconfiguredError(
             f"mocap.interface = {interface!r}: no network card with this name or IPv4 address: "
-            "correct it (`ip address` lists them), or remove it"
+            "correct the key (`ip address` lists the cards), or remove the key"
         ) from error

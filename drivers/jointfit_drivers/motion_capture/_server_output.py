@@ -13,8 +13,8 @@ class ServerOutput:
     """Emits the chunks of a server, across all connections of a driver.
 
     If frames have stopped, or a connection has answers but no frame, answers are not emitted before
-    the next frame. A server that only answers is therefore no source of data, and its loss is
-    reported only once.
+    the next frame. Otherwise a server that sends only answers would be reported as lost again at
+    every connection.
     """
 
     def __init__(self) -> None:

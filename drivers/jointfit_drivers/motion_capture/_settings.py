@@ -53,7 +53,7 @@ class ServerSettings(MocapSettings):
             address.is_multicast or address.is_unspecified
         ):
             raise ValueError(
-                f"{server} is the address of no host: expected the address of the server"
+                f"{server} is not the address of a host: expected the address of the server"
             )
         return server
 

@@ -29,9 +29,9 @@ class TcpLink(SocketLink):
     Parameters
     ----------
     name : str
-        Name and port of the server, for messages.
+        Name and port of the server, for error messages.
     remedy : str
-        Advice that is displayed if no program listens on the port.
+        Advice in the error message if no program listens on the port.
     take : callable
         Function that is called with all received bytes in the order of arrival.
     """

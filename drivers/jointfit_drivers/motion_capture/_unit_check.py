@@ -10,9 +10,9 @@ from __future__ import annotations
 _LARGEST_M = 50.0
 """Coordinate that exceeds every camera volume, m."""
 _SMALLEST_MM = 20.0
-"""Distance from the origin that tracked bodies exceed sooner or later, mm."""
+"""Coordinate that at least one of the first `_REPORTS` positions in mm exceeds, mm."""
 _REPORTS = 500
-"""Number of positions within which coordinates in mm have exceeded `_SMALLEST_MM`."""
+"""Number of positions that are checked."""
 
 
 class UnitCheck:
@@ -21,7 +21,7 @@ class UnitCheck:
     Parameters
     ----------
     unit : str
-        Configured unit, ``m`` or ``mm``.
+        Configured unit. Only ``m`` and ``mm`` are checked.
     """
 
     def __init__(self, unit: str) -> None:
@@ -30,7 +30,7 @@ class UnitCheck:
         self._reports = 0
 
     def feed(self, x: float, y: float, z: float) -> str | None:
-        """Return a warning for a position, given as sent; None if there is no new warning."""
+        """Add a position as sent by the server; return a warning, or None without new warning."""
         if self._reports > _REPORTS:
             return None
         largest = max(abs(x), abs(y), abs(z))

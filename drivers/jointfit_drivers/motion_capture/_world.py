@@ -31,7 +31,7 @@ ABSENT = (NO_POSITION, NO_ORIENTATION)
 NORM_TOLERANCE = 1e-3
 """Largest deviation of a quaternion's norm from 1."""
 FARTHEST_M = 10_000.0
-"""Largest plausible coordinate, m. Comparisons treat NaN as larger."""
+"""Largest plausible coordinate, m. A comparison with it must also reject NaN."""
 _MATRIX_TOLERANCE = 1e-2
 """Largest row sum of the absolute elements of RᵀR - I."""
 _LEAST_DETERMINANT = 0.5

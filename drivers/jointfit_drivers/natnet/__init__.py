@@ -1,4 +1,4 @@
-"""Driver for motion capture by the protocol NatNet of OptiTrack, over UDP."""
+"""Driver for motion capture with OptiTrack's protocol NatNet, over UDP."""
 
 from jointfit_drivers.natnet._decoder import NatNetDecoder
 from jointfit_drivers.natnet._driver import NatNetMocap

@@ -4,8 +4,8 @@ A labeled marker has the id ``model << 16 | member``. The model is a rigid body,
 asset. The name of a member is the marker name in the description (bitstream 4.0 and later). Without
 such a name, the member has the name of the marker at the same position in the marker set with the
 model's name. Without such a set, the markers of a rigid body are named ``Marker1``, ``Marker2`` and
-so on; those of a skeleton have no names and are not used. Markers of a set without a model are
-identified by set and position. The set ``all`` is ignored, because it repeats the other sets.
+so on; the markers of a skeleton have no names and are not used. Markers of a set without a model
+are identified by set and position. The set ``all`` is ignored, because it repeats the other sets.
 
 `jointfit_drivers.motion_capture.bind_columns` defines the names of the columns.
 
@@ -42,11 +42,11 @@ _MEMBER = (1 << _MEMBER_BITS) - 1
 
 @dataclass(frozen=True, slots=True)
 class Binding:
-    """Columns of the frames. They are valid until the model changes."""
+    """Columns of the frames, valid until the server's model changes."""
 
     columns: ColumnBinding
     known: frozenset[ColumnKey]
-    """All ids in the model, including ids that are not accepted."""
+    """All ids in the model, including ids that are not used because several models share them."""
     loose_sets: frozenset[str]
     """Names of marker sets whose positions are read directly from the sets."""
 
@@ -85,7 +85,8 @@ def bind_model(
 
     columns = bind_columns(markers_found, bodies_found, markers, bodies)
     refused = tuple(
-        f"streaming id shared by {' and '.join(names[:MOST_NAMED])}: refused; give each its own"
+        f"{' and '.join(names[:MOST_NAMED])} have the same streaming id and are not used: give "
+        "each its own id"
         for names in list(shared.values())[:MOST_NAMED]
     )
 

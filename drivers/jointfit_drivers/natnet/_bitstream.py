@@ -57,7 +57,7 @@ class BitstreamTracker:
         return self.version != UNKNOWN
 
     def announce(self, version: Version) -> None:
-        """Process the version in a SERVERINFO. The first is used; later versions are candidates."""
+        """Add the version in a SERVERINFO. The first version is used; later ones are candidates."""
         self._announced = version
         if not self.known or not is_supported(self.version):
             self.version = version
@@ -78,7 +78,7 @@ class BitstreamTracker:
         self._confirmed = None
 
     def decode(self, datagram: bytes) -> Message | CorruptBytes:
-        """Return the message in `datagram`. If only a candidate can decode it, use that version."""
+        """Return the message in `datagram`. If only a candidate decodes it, use the candidate."""
         key = self.version, len(datagram)
         layout = self._layouts.get(key)
         if layout is not None:

@@ -1,9 +1,9 @@
 """Decoder of NatNet servers: converts datagrams to optical frames and clock echoes.
 
-A capture contains datagrams in both directions. Datagrams from a client have one effect: the
-arrival of an echo request is used as the sending time of the request. A frame that arrives before
-the model is dropped and counted in `unpublished`. Every number is checked against its range before
-it is used.
+A network capture contains datagrams in both directions. Datagrams from a client have one effect:
+the arrival of an echo request is used as the sending time of the request. A frame that arrives
+before the model is dropped and counted in `unpublished`. Every number is checked against its range
+before it is used.
 
 Invariant: the output depends only on the chunks fed. The decoder reads no clock and no socket.
 """
@@ -108,7 +108,7 @@ class NatNetDecoder:
         return self._continuity.late
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return the content of one datagram; never raise."""
+        """Return the frames, echoes and events of one datagram; never raise."""
         before = self._bitstream.version
         message = self._bitstream.decode(chunk.data)
         if isinstance(message, CorruptBytes):
@@ -133,7 +133,7 @@ class NatNetDecoder:
         return []
 
     def _take(self, chunk: Chunk, message: natnet.Message, out: list[Decoded]) -> None:
-        """Append the content of one message. Messages of clients have no content."""
+        """Append the frame, echo or events of one message. A message of a client adds nothing."""
         match message:
             case natnet.FrameOfData():
                 self._frame(chunk, message, out)
@@ -159,7 +159,7 @@ class NatNetDecoder:
     # --- server and model ---------------------------------------------------------------------
 
     def _server(self, info: natnet.ServerInfo, out: list[Decoded]) -> None:
-        """Append the description of a new or changed server."""
+        """Append the events of a new or changed server."""
         before = self._info
         # An implausible frequency would make the stamps of all frames wrong.
         self._info, self._hz = info, usable_hz(info)
@@ -190,7 +190,7 @@ class NatNetDecoder:
 
         if not natnet.is_supported(info.bitstream):
             name = "{}.{}".format(*info.bitstream)
-            text = f"the server uses NatNet {name}, 2.5 or newer is required"
+            text = f"the server uses NatNet {name}; 2.5 or newer is required"
             out.append(DeviceEvent("error", text, {"bitstream": name}))
 
     def _model(self, model: natnet.ModelDefinition, out: list[Decoded]) -> None:
@@ -249,7 +249,7 @@ class NatNetDecoder:
             if new and len(self._named_unknown) < _NAMED_UNKNOWN:
                 self._named_unknown.update(new)
                 names = ", ".join(f"{i >> 16}:{i & 0xFFFF}" for i in new[:_NAMED_UNKNOWN])
-                text = f"ids that are not in the model list are dropped: {names}"
+                text = f"markers or bodies with ids outside the model list are dropped: {names}"
                 out.append(DeviceEvent("warning", text, {"ids": new[:_NAMED_UNKNOWN]}))
         ticks = self._exposure_ticks(frame, out)
         out.append(
@@ -283,7 +283,7 @@ class NatNetDecoder:
         if self._stamped:
             self._stamped = False
             text = (
-                "no exposure stamps (USB cameras?): the exposure is assumed to be "
+                "the frames have no exposure stamps (USB cameras?): the exposure is assumed to be "
                 f"{self._latency_ms:g} ms before transmission"
             )
             out.append(DeviceEvent("warning", text, {"latency_ms": self._latency_ms}))

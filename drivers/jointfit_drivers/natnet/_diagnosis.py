@@ -45,9 +45,9 @@ if TYPE_CHECKING:
 _MULTICAST_S = 1.0
 """Duration of the reception of multicast frames at all network cards, s."""
 _NEWEST = "4.2"
-"""Newest bitstream version with a published description. Sections of later versions are skipped."""
+"""Newest bitstream version with a published description."""
 _STILL = 3
-"""Number of repetitions from which the frame number counts as unchanged."""
+"""Number of repeated frame numbers from which the frames count as paused."""
 _STREAMING = (
     "in Motive's Streaming pane enable streaming and select the local interface of this network "
     "(not loopback); in playback, press play"
@@ -87,7 +87,7 @@ async def diagnose(settings: NatNetSettings, wait_s: float) -> list[Finding]:
         host = await host_address(name)
     except OSError:
         text = f"no such host: {name!r} has no IPv4 address"
-        remedy = "set server in [mocap] to the address that Motive's PC has: ipconfig"
+        remedy = "set server in [mocap] to the address of Motive's PC (`ipconfig` displays it)"
         return [Finding(CHECK, name, "error", text, remedy)]
 
     cards = network_cards()
@@ -97,7 +97,7 @@ async def diagnose(settings: NatNetSettings, wait_s: float) -> list[Finding]:
         listed = ", ".join(f"{card.name} ({card.address})" for card in cards)
         if settings.interface is None:
             text = f"no route to {host}: {error.strerror}; this host has {listed}"
-            return [Finding(CHECK, name, "error", text, f"ip route get {host}")]
+            return [Finding(CHECK, name, "error", text, f"run `ip route get {host}`")]
         text = f"no network card {settings.interface!r}; this host has {listed}"
         remedy = "set interface in [mocap] to one of them, or remove the key"
         return [Finding(CHECK, name, "error", text, remedy)]
@@ -124,11 +124,11 @@ def _unanswered_finding(settings: NatNetSettings, failure: Exception | None) -> 
     """Return the finding for a server that does not answer CONNECT."""
     name, port = settings.server, settings.command_port
     if isinstance(failure, DeviceMisconfiguredError):
-        remedy = "set server and command_port in [mocap] to those in Motive's Streaming pane"
+        remedy = "set server and command_port in [mocap] to the values in Motive's Streaming pane"
         return Finding(CHECK, name, "error", str(failure), remedy)
     refused = failure is not None and isinstance(failure.__cause__, ConnectionRefusedError)
     if refused:
-        text = f"streaming off: {name} refuses UDP port {port}, no program listens"
+        text = f"streaming off: {name} refuses UDP port {port}, because no program listens"
         return Finding(CHECK, name, "error", text, f"start Motive; {_STREAMING}")
     text = (
         f"no answer from {name}, UDP port {port}: the address is wrong, a firewall drops the "
@@ -148,7 +148,7 @@ async def _missing_frames(
     oldest = ".".join(map(str, OLDEST))
 
     if major > NEWEST_MAJOR or (reception.datagrams and major >= NEWEST_MAJOR):
-        text = f"the server streams bitstream {natnet}, the newest known one is {_NEWEST}"
+        text = f"the server streams bitstream {natnet}, the newest known version is {_NEWEST}"
         remedy = 'switch Motive to unicast, and set bitstream = "4.1" in [mocap]'
         return [Finding(CHECK, name, "error", text, remedy)]
     if tuple(map(int, natnet.split("."))) < OLDEST:
@@ -161,7 +161,7 @@ async def _missing_frames(
 
     multicast = server["transport"] == "multicast"
     if settings.transport not in ("auto", server["transport"]):
-        text = f"the server sends {server['transport']}, transport = {settings.transport!r}"
+        text = f"the server sends {server['transport']}, but transport = {settings.transport!r}"
         return [Finding(CHECK, name, "error", text, 'set transport = "auto" in [mocap]')]
     if multicast:
         return [await _missing_multicast(settings, route, server)]
@@ -213,14 +213,14 @@ def _stream_findings(settings: NatNetSettings, reception: NatNetReception) -> li
             )
         )  # fmt: skip
     for text in reception.warnings:
-        remedy = "correct the names in [mocap], or those of the assets in Motive"
+        remedy = "correct the names in [mocap], or the names of the assets in Motive"
         findings.append(Finding(CHECK, name, "error", text, remedy))
 
     still = reception.decoder.duplicates >= _STILL
     if not frames[-1].live:
         text = "playback paused: the frames repeat one instant of a recording"
         if not still:
-            text = "the frames are those of a recording (edit mode), not of the cameras"
+            text = "the frames come from a recording (edit mode), not from the cameras"
         level: Any = "error" if still else "warning"
         findings.append(Finding(CHECK, name, level, text, "switch Motive to live mode"))
     elif still:

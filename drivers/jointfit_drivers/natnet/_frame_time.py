@@ -44,7 +44,7 @@ class FrameTime:
         return _UNIX if self._precise is not None and self._precise.decided else None
 
     def unix_ns(self, frame: FrameOfData, out: list[Decoded]) -> int | None:
-        """Return the UNIX time of a frame; None if the frame has none, which causes one warning."""
+        """Return the UNIX time of a frame; None, with one warning, if frames have no timestamp."""
         precise = self._precise
         if precise is None:
             return None

@@ -1,4 +1,4 @@
-"""Findings about the network card that is used for a NatNet server, and about lost multicast."""
+"""Findings about the network card for a NatNet server, and search for its multicast frames."""
 
 from __future__ import annotations
 
@@ -71,8 +71,9 @@ def card_findings(
         return [
             Finding(
                 CHECK, name, "note" if arrived else "warning",
-                f"two interfaces reach {host}: {listed}; multicast frames may arrive at either",
-                f'set interface = "{local}" in [mocap], or disconnect one: '
+                f"several interfaces reach {host}: {listed}; multicast frames may arrive at any of "
+                "them",
+                f'set interface = "{local}" in [mocap], or disconnect a card: '
                 f"sudo ip link set {reaching[-1].name} down",
             )
         ]  # fmt: skip
@@ -82,7 +83,7 @@ def card_findings(
 async def multicast_arrivals(
     group: str, port: int, host: str, cards: Sequence[NetworkCard], wait_s: float
 ) -> dict[str, int]:
-    """Return the number of frames of a multicast group that arrive at each card, by address."""
+    """Return how many frames of a multicast group arrive at each card, by the card's address."""
     counts = {card.address: 0 for card in cards}
     with contextlib.ExitStack() as stack:
         opened = []

@@ -30,7 +30,7 @@ MODELDEF."""
 ECHO_NS = 1_000_000_000
 """Age of an echo request above which its answer is not used for the clock, ns."""
 OPEN_ECHOES = 32
-"""Largest number of stored echo requests without answer. Ten are sent at the connection."""
+"""Largest number of stored echo requests without answer. A connection begins with ten requests."""
 
 _REQUEST_OF_ANSWER = {
     NatNetMessageId.SERVERINFO: NatNetMessageId.CONNECT,
@@ -55,7 +55,7 @@ class OpenRequests:
     def register(self, message: Message, now_ns: int) -> None:
         """Register a message that was sent at `now_ns`.
 
-        The stamp of an echo is its sending time.
+        An echo request contains its own sending time, so `now_ns` is not used.
         """
         if isinstance(message, EchoRequest):
             if len(self._echoes) >= OPEN_ECHOES:
@@ -87,7 +87,7 @@ class OpenRequests:
             asked_ns = self._asked_ns.pop(_REQUEST_OF_ANSWER[NatNetMessageId(kind)], None)
             accepted = asked_ns is not None and now_ns - asked_ns <= ANSWER_NS
         else:
-            accepted = True  # no effect, but corrupt bytes are counted
+            accepted = True  # without effect, but the decoder counts corrupt bytes
 
         self.unsolicited += not accepted
         return accepted

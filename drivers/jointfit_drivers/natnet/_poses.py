@@ -1,10 +1,9 @@
 """Conversion of one NatNet frame to columns: SI units, world z up, NaN for missing data.
 
-The server marks missing data. If bit 0 of the params of a body is clear, the body
-repeats its last valid pose. A
-labeled marker that is not visible is absent, or it is flagged as occluded and has an estimated
-position. A missing position in a marker set is (0, 0, 0). A marker is usable if it is
-point-cloud solved and not occluded.
+The server marks missing data. If bit 0 of the params of a body is clear, the body repeats its last
+valid pose. A labeled marker that is not visible is absent, or it is flagged as occluded and has an
+estimated position. A missing position in a marker set is (0, 0, 0). A labeled marker is usable if
+its flags state that the cameras measured it ("point-cloud solved") and that it is not occluded.
 """
 
 from __future__ import annotations

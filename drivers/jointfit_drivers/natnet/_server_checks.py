@@ -19,18 +19,18 @@ NEWEST_MAJOR = 4
 LEAST_CLOCK_HZ = 1_000
 """Lowest usable frequency of the server's counter, Hz. A slower counter stamps too coarsely."""
 MOST_CLOCK_HZ = 100_000_000_000
-"""Highest plausible frequency, Hz, which is ten times that of the fastest processor counter."""
+"""Highest plausible frequency, Hz: ten times the frequency of the fastest processor counter."""
 _PLAIN_FORM = 264
 _BITSTREAM_FORM = 271
 _LONGEST_VERSION = len("99.99")
 
 
 def connect_request(settings: NatNetSettings) -> Connect:
-    """Return the CONNECT message to send, in the form that real servers answer.
+    """Return the CONNECT message to send, in a form that real servers answer.
 
-    If the settings name a bitstream version, which only unicast 4.x servers can select, the message
-    has the form of the vendor's sample program (271 bytes). Otherwise it has the form of NatNetLib
-    3 (264 bytes).
+    If the settings name a bitstream version, which clients of unicast 4.x servers can select, the
+    message has the form of the vendor's sample program (271 bytes). Otherwise it has the form of
+    the vendor's library NatNetLib 3 (264 bytes).
     """
     wanted = settings.wanted_version
     if wanted is None:
@@ -80,7 +80,7 @@ def check_server(name: str, settings: NatNetSettings, info: ServerInfo) -> None:
         )
     if settings.wanted_version not in (None, info.bitstream) and not is_unicast(settings, info):
         raise DeviceMisconfiguredError(
-            f"{found} in multicast, where a client cannot choose it: remove bitstream ="
+            f"{found} in multicast, where a client cannot choose the version: remove bitstream ="
             f" {settings.bitstream!r}, or switch Motive to unicast"
         )
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 COMMAND_PORT = 1510
 """Default command port of Motive."""
 _TRIES = 3
-"""Number of requests to a host or network, because datagrams may be lost."""
+"""Number of times that a request is sent, because datagrams may be lost."""
 _REQUEST = natnet.Connect(264, "jointfitd", (1, 0, 0, 0), (3, 0, 0, 0))
 
 

@@ -56,8 +56,8 @@ MODEL_S = 5.0
 """Longest wait for MODELDEF, s."""
 FIRST_ECHOES, FIRST_ECHO_S = 10, 0.05
 ECHO_S = (0.8, 1.2)
-"""Range of the interval between echoes, s. It is random, so that echoes do not synchronize with the
-frame rate."""
+"""Range of the interval between echoes, s. The interval is random, so that echoes do not
+synchronize with the frame rate."""
 EVERY_S = 1.0
 """Interval between keep-alive messages, between requests for a changed model, and between checks of
 a whole frame, s."""
@@ -106,7 +106,7 @@ class NatNetSession:
         self._next_check_ns = self._frame_ns = 0
 
     async def run(self) -> None:
-        """Connect and read until cancelled. The errors are those of `NatNetMocap.run`."""
+        """Connect and read until cancelled. Raises the same errors as `NatNetMocap.run`."""
         with self._link as link:
             info = await self._connect()
             check_server(self._name, self._settings, info)
@@ -134,9 +134,9 @@ class NatNetSession:
                 await self._request(model, MODEL_S, lambda: self._known is not None)
                 if self._known is None:
                     raise DeviceLostError(
-                        f"{self._name}: answers, but sends no readable list of markers and bodies "
-                        f"(MODELDEF) within {MODEL_S:g} s: check the network, and restart "
-                        "streaming in the camera software"
+                        f"{self._name}: the server answers, but sends no readable list of markers "
+                        f"and bodies (MODELDEF) within {MODEL_S:g} s: check the network, and "
+                        "restart streaming in the camera software"
                     )
                 await self._stream(info, unicast)
             finally:
@@ -228,7 +228,7 @@ class NatNetSession:
             )
         raise DeviceLostError(
             f"{self._name}: no answer within {CONNECT_S:g} s: check that the camera software runs, "
-            "server, command_port and firewalls; `jointfit doctor` names the cause"
+            "and check server, command_port and firewalls; `jointfit doctor` names the cause"
         )
 
     async def _stream(self, info: natnet.ServerInfo, unicast: bool) -> None:
@@ -263,15 +263,15 @@ class NatNetSession:
         """Raise DeviceLostError if no frame can be decoded, or if another server answers."""
         if self._info is not None and not same_instance(self._info, info):
             raise DeviceLostError(
-                f"{self._name}: restarted, or another server took its address "
+                f"{self._name}: the server restarted, or another server took its address "
                 f"({self._info.application} answers): connecting again"
             )
 
         if (time.monotonic_ns() - last_ns) / 1e9 < self._settings.silence_s:
             return
 
-        # The text must not contain a measured duration. It would differ at every attempt, and every
-        # different text becomes a new line of the log.
+        # The text must not contain a measured duration, because every different text becomes a new
+        # line of the log.
         if self._misfits:
             version = "{}.{}".format(*self._bitstream.version)
             raise DeviceLostError(

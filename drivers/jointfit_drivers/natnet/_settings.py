@@ -34,7 +34,7 @@ class NatNetSettings(ServerSettings):
         "server",
         description="clock of the frames: the `server`'s own counter, measured by echoes; or the "
         "precision timestamp of cameras on PTP (bitstream 4.1), if PTP also sets this host's "
-        "clock: `ptp` counts as PTP does (TAI), `utc` as UNIX time does",
+        "clock: `ptp` for timestamps in TAI, `utc` for timestamps in UNIX time",
     )
     tai_minus_utc_s: int = Field(
         37, ge=0, le=100, description="leap seconds by which PTP time is ahead of UTC"
@@ -42,7 +42,7 @@ class NatNetSettings(ServerSettings):
 
     @property
     def wanted_version(self) -> tuple[int, int] | None:
-        """The key `bitstream` as two numbers; None if it is not set."""
+        """The key `bitstream` as two numbers; None if the key is not set."""
         if self.bitstream is None:
             return None
         major, minor = self.bitstream.split(".")

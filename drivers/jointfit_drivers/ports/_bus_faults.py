@@ -1,7 +1,7 @@
 """Faults in a ``[can.NAME]`` table that python-can would report only when it opens the bus.
 
-The permitted keys of an interface are the parameters of python-can's class, and the parameters that
-its documentation describes.
+The permitted keys of an interface are the parameters in the signature and in the docstrings of
+python-can's class for this interface.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ _NUMBERS = {bool: "true or false", int: "a whole number", float: "a number", str
 
 
 def bus_faults(settings: CanBusSettings) -> dict[str, str]:
-    """Return the faults of a table, by key, because of which its bus cannot be opened on this host.
+    """Return the faults of a table that prevent opening its bus on this host, by key.
 
     No device is opened. The module of the interface is imported, because only the import shows
     whether the vendor's library is installed.
@@ -114,7 +114,7 @@ def _unknown_keys(settings: CanBusSettings, parameters: Collection[str]) -> dict
 
 
 def _wrong_values(settings: CanBusSettings, parameters: dict[str, Any]) -> dict[str, str]:
-    """Return the keys of python-can whose value has a wrong type or is out of range."""
+    """Return the faults of values that have a wrong type or are out of range, by key."""
     faults = {}
     for name, value in (settings.model_extra or {}).items():
         kind = type(parameters.get(name))
@@ -136,7 +136,7 @@ def _wrong_values(settings: CanBusSettings, parameters: dict[str, Any]) -> dict[
 
 
 def _wrong_choices(settings: CanBusSettings, backend: Any) -> dict[str, str]:
-    """Return the keys whose values are not among the permitted choices of an interface."""
+    """Return the faults of values that are not among the choices of an interface, by key."""
     extra, faults = settings.model_extra or {}, {}
     if settings.interface == "udp_multicast" and not _is_multicast(settings.channel):
         faults["channel"] = "expected a multicast address, such as '239.74.163.2'"
@@ -169,7 +169,7 @@ def _load_backend(kind: str) -> type[can.BusABC] | str:
             return cannot_load(kind, f"the Python package {package!r} is not installed")
         if kind in _LIBRARIES:
             CDLL(_LIBRARIES[kind])
-    except Exception as error:  # noqa: BLE001 - vendors' modules raise anything without the library
+    except Exception as error:  # noqa: BLE001 - vendors' modules may raise any exception
         return cannot_load(kind, error)
     return backend
 

@@ -1,11 +1,11 @@
 """Opening of python-can buses in a thread with a time limit, and a check of a CAN server.
 
 Vendor libraries may wait without limit, and a call of a library cannot be interrupted. python-can
-repeats the connection to a socketcand server in a loop without pauses, and waits for the server's
-greeting without limit.
+repeats the attempt to connect to a socketcand server in a loop without pauses, and waits for the
+server's greeting without limit.
 
-Invariant: for each bus at most one thread is opening it, and no such thread delays the end of the
-process.
+Invariant: each bus is opened by at most one thread at a time, and no such thread delays the end of
+the process.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ _SERVER_S = 1.5
 _GREETING, _OPENED = "< hi >", "< ok >"
 """Texts that a socketcand server sends: its greeting, and its answer after it opened a bus."""
 _LONGEST = 40
-"""Longest answer that is read, bytes. It suffices to describe another type of server."""
+"""Largest number of bytes of an answer that are read. If another type of server answers, this is
+enough to recognize the type in the error message."""
 
 _opening: set[str] = set()
 """Keys of the buses that a thread is currently opening."""
@@ -86,7 +87,7 @@ async def open_in_thread(key: str, name: str, make: Callable[[], _Bus]) -> _Bus:
         with suppress(TimeoutError):
             async with asyncio.timeout(OPEN_S):
                 await ended.wait()
-        if made.cancel():  # not open yet; the thread will close it
+        if made.cancel():  # not open yet; the thread closes the bus later
             raise too_long
     except asyncio.CancelledError:
         if not made.cancel() and made.exception() is None:
@@ -121,8 +122,8 @@ def require_socketcand(channel: str, host: str, port: int) -> None:
     Raises
     ------
     DeviceLostError
-        No server accepts the connection, the answer is not that of socketcand, or the bus is
-        refused.
+        No server accepts the connection, the answering program is not socketcand, or the server
+        refuses the bus.
     """
     server = f"{channel}: socketcand server {host}:{port}"
     remedy = "start socketcand there, or correct host and port in its [can] table"
@@ -144,8 +145,8 @@ def require_socketcand(channel: str, host: str, port: int) -> None:
         )
     if opened != _OPENED:
         raise DeviceLostError(
-            f"{server}: found {opened!r} after opening {channel}, expected {_OPENED!r}: let the "
-            f"server serve it (`socketcand -i {channel}`), or correct `channel`"
+            f"{server}: found {opened!r} after opening {channel}, expected {_OPENED!r}: start "
+            f"the server for this bus (`socketcand -i {channel}`), or correct `channel`"
         )
 
 

@@ -71,7 +71,8 @@ class PythonCanBus:
     Parameters
     ----------
     settings : CanBusSettings
-        Table ``[can.NAME]`` of rig.toml. Unknown keys are passed to python-can unchanged.
+        Table ``[can.NAME]`` of rig.toml. Keys that `CanBusSettings` does not define are passed to
+        python-can unchanged.
     """
 
     def __init__(self, settings: CanBusSettings) -> None:
@@ -203,7 +204,7 @@ class PythonCanBus:
                 deliver(now, frames)
 
     def _convert_frame(self, message: can.Message) -> CanFrame:
-        """Convert a frame that was just read. Its stamp is that of the kernel, or the current time.
+        """Convert a frame that was just read. It gets the kernel's stamp, or else the current time.
 
         A time from before the read would be too early for frames that arrived in the meantime. This
         would cause an error, because clocks are fitted to the earliest arrivals.
@@ -271,7 +272,7 @@ class PythonCanBus:
 
 
 def _socket(bus: can.BusABC) -> socket.socket:
-    sock: socket.socket = bus.socket  # type: ignore[attr-defined]  # SocketCAN's own
+    sock: socket.socket = bus.socket  # type: ignore[attr-defined]  # SocketCAN only
     return sock
 
 

@@ -1,7 +1,7 @@
 """A CAN bus through an SLCAN adapter on a serial port: handshake, then reception of frames.
 
 The SLCAN backend of python-can takes hundreds of microseconds per frame, so it is not used. The
-adapter is opened as a normal node (``O``) and not as a silent listener, because a single sensor
+adapter opens its bus as a normal node (``O``) and not as a silent listener, because a single sensor
 needs a second node that acknowledges its frames. The adapter never sends a frame.
 """
 
@@ -148,7 +148,7 @@ class SlcanBus:
         if lost > _NOT_SLCAN and not self._understood:
             raise DeviceMisconfiguredError(
                 f"{settings.channel}: no SLCAN adapter found at {settings.baud} baud "
-                "(bytes arrive, none of them SLCAN): set `channel` to the adapter's port "
+                "(bytes arrive, but no SLCAN message): set `channel` to the adapter's port "
                 "and `baud` to its speed"
             )
         if answer == "\a":
@@ -160,7 +160,10 @@ class SlcanBus:
             log.debug("%s: the adapter sends no answers; reading anyway", settings.channel)
 
     async def _ask(self, command: bytes, expected: str = "") -> str | None:
-        """Send `command`; return the letter of its answer (`expected` or BELL), or None."""
+        """Send `command`; return the letter of its answer (`expected` or BELL).
+
+        Return None if no such answer arrives within 0.3 s.
+        """
         await self._port.write(command)
         loop = asyncio.get_running_loop()
         until = loop.time() + _ANSWER_S

@@ -18,7 +18,7 @@ ANCILLARY_BYTES = socket.CMSG_SPACE(_STAMP.size)
 class SocketStamps(WallClock):
     """Converts the stamps of one socket. Call `pair` at every wake-up.
 
-    If the system has no such stamps, as an emulator, the time of the read is used.
+    If the system provides no stamps, for example in an emulator, the time of the read is used.
 
     Parameters
     ----------

@@ -1,14 +1,16 @@
 """CAN buses. Each bus is opened once and shared by all devices on it.
 
 A bus is open while a device uses it. Every device receives chunks that contain only its own frames.
-If a bus fails, all its devices are lost, and each device raises a separate `DeviceLostError`.
+If a bus fails, all its devices are lost: `SharedBus.pump` raises a separate `DeviceLostError` for
+each device.
 
 The event loop reads a bus through ``loop.add_reader`` on its file descriptor, up to 64 frames per
-wake-up. A backend without file descriptor is read by one thread that delivers batches. python-can's
-Notifier is not used, because it ignores receive errors.
+wake-up. A backend (python-can's class for one type of bus) without file descriptor is read by one
+thread, which delivers the frames in batches. python-can's Notifier is not used, because it ignores
+receive errors.
 
-Invariant: drivers use python-can only through this module, which contains no device and no message
-format.
+Invariant: drivers use python-can only through this module. The module depends on no device and no
+message format.
 """
 
 from __future__ import annotations
@@ -41,8 +43,8 @@ CanKey = tuple[int, bool]
 """Identifier of a frame, and whether it has 29 bits."""
 
 _UNCLAIMED = 512
-"""Largest number of stored frames without subscriber. Four sensors that send 400 frames per second
-each fill the store in a third of a second."""
+"""Largest number of stored frames without subscriber ("unclaimed" frames). Four sensors that send
+400 frames per second each fill the store in a third of a second."""
 _CLAIM_NS = 300_000_000
 """Largest age of stored frames that are delivered to a new subscriber, ns. The devices of a rig
 start at almost the same time, so their first frames may arrive before they subscribe."""
@@ -160,11 +162,12 @@ class SharedBus:
         worked: bool = False,
         configured_by: str = "with the configuration program of the device",
     ) -> None:
-        """Emit every frame that has one of `ids`, in chunks of packed frames, until cancelled.
+        """Emit every frame whose identifier is in `ids`, until cancelled.
 
-        Error frames are emitted as well, and the records with which this host counts dropped frames
-        (`host_dropped`) and corrupt bytes (`host_corrupt`). A record of corrupt bytes is emitted
-        for one device only, so that the bytes are counted once.
+        A chunk contains packed frames. Error frames are emitted as well. So are the records that
+        contain the number of dropped frames (`host_dropped`) or of corrupt bytes (`host_corrupt`)
+        on this host. A record of corrupt bytes is emitted for one device only, so that the bytes
+        are counted once.
 
         Parameters
         ----------
@@ -181,7 +184,8 @@ class SharedBus:
         needed : CanKey
             Identifier of the frames with measurements; one of `ids`.
         first_s : float, optional
-            Longest wait for the first of these frames, s. The default is `silence_s`.
+            Longest wait for the first frame with the identifier `needed`, s. The default is
+            `silence_s`.
         resembles : callable
             Function that returns whether the data of a frame resemble the data of `needed` frames.
             The result is used for a hint in the error message.
@@ -203,8 +207,8 @@ class SharedBus:
             if other is not None:
                 raise DeviceMisconfiguredError(
                     f"{self.channel}: CAN identifier {_hex(key)} ({carries}) is also "
-                    f"that of {other.name} ({other.ids[key]}): give each sensor a block of its own "
-                    f"({configured_by}) and set `ids` of both"
+                    f"used by {other.name} ({other.ids[key]}): give each sensor identifiers of its "
+                    f"own ({configured_by}) and set `ids` of both sensors"
                 )
 
         # The future ends with the error of the bus or of `emit`, or with a result after silence.
@@ -254,9 +258,9 @@ class SharedBus:
             key for key, t_ns in subscriber.arrived.items() if t_ns > since_ns and key != needed
         )
 
-        # All identifiers arrived before, so the settings are correct. The text contains no
-        # duration. A duration would differ at every attempt, and every different text becomes a new
-        # line of the log.
+        # The required identifier has arrived before, so the settings are correct. The text contains
+        # no duration. A duration would differ at every attempt, and every different text becomes a
+        # new line of the log.
         if not others and (subscriber.is_complete or (worked and not self._seen)):
             return f"{self.channel}: silent: check its power and wiring"
 
@@ -287,11 +291,11 @@ class SharedBus:
         self._filter()
 
     def _belongs(self, key: CanKey) -> bool:
-        """Return whether a device of the rig uses the identifier, even if not subscribed."""
+        """Return whether a device of the rig, subscribed or not, uses the identifier."""
         return any(key in ids for ids in self._ids.values())
 
     def _filter(self) -> None:
-        """Make the kernel drop unclaimed frames as soon as every device receives its frames."""
+        """Make the backend drop unclaimed frames when every device has its required identifier."""
         if self._backend is not None and self._failed is None:
             complete = all(each.is_complete for each in self._subscribers)
             self._backend.listen(self._routes if complete else None)
@@ -299,7 +303,8 @@ class SharedBus:
     def _claim(self, subscriber: _Subscriber) -> None:
         """Deliver frames that arrived shortly before this device subscribed.
 
-        The first device of a rig opens the bus, and frames of the other devices arrive immediately.
+        The first device of a rig opens the bus. Frames of the other devices then arrive before
+        these devices subscribe.
         """
         waiting, self._unclaimed = self._unclaimed, deque(maxlen=_UNCLAIMED)
 
@@ -344,7 +349,7 @@ class SharedBus:
                 self._filter()
 
     def _fail(self, error: Exception) -> None:
-        """End the pump of every device. The first device that ends closes the bus."""
+        """End the pump of every device. The first device that leaves the bus closes it."""
         self._failed = error
         for each in self._subscribers:
             if not each.ended.done():

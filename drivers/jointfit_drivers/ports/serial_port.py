@@ -41,7 +41,8 @@ _WRITE_TIMEOUT_S = 2.0
 _NOT_A_PORT = frozenset(
     {errno.ENOTTY, errno.EINVAL, errno.EISDIR, errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG}
 )
-"""Error numbers of a file that is not a terminal. All others concern the system or the hardware."""
+"""Error numbers of a file that is not a terminal. All other numbers concern the system or the
+hardware."""
 
 _LOST: dict[int, str] = {
     errno.ENOENT: "is not there",

@@ -68,8 +68,7 @@ class TcpConnection:
         Raises
         ------
         OSError
-            The server refuses the connection or cannot be reached. TimeoutError: it does not
-            answer.
+            The server refuses the connection, cannot be reached, or does not answer (TimeoutError).
         """
         opened = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         try:
@@ -111,7 +110,8 @@ class TcpConnection:
         Raises
         ------
         OSError
-            The connection is lost. ConnectionResetError also means that the server closed it.
+            The connection is lost. If the server closed the connection, this is a
+            ConnectionResetError.
         """
         self._stamps.pair()
         try:

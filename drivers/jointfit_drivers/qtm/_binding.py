@@ -1,10 +1,11 @@
-"""Assignment of positions in the components of frames to the names in rig.toml.
+"""Assignment of the markers and bodies in QTM's frames to the names in rig.toml.
 
-Markers and bodies have no ids; their order is the order in the XML document of the settings. QTM
-can send the pose of a body relative to another body or to a fixed pose. Such a body is rejected.
+Markers and bodies have no ids: a frame contains them in the order of QTM's settings, which are an
+XML document. QTM can send the pose of a body relative to another body or to a fixed pose. Such a
+body is rejected.
 
 Invariant: the module is pure. A binding applies only to frames with the same numbers of markers and
-bodies as its XML.
+bodies as the settings from which the binding was made.
 """
 
 from __future__ import annotations
@@ -33,9 +34,10 @@ class QtmBinding:
 
     columns: ColumnBinding
     marker_places: list[int]
-    """Index of each marker column in the 3D component."""
+    """Index of each marker column in the 3D component (the part of a frame with the markers)."""
     body_keys: tuple[int, ...]
-    """Index of each body column in the 6D component, or its `segment_key`."""
+    """Index of each body column in the 6D component (the part of a frame with the bodies), or the
+    `segment_key` of the column."""
     labels: int
     """Number of labeled markers."""
     bodies: int

@@ -27,7 +27,7 @@ _NEXT, _DROP, _RESTART = FrameStep(), FrameStep(use=False), FrameStep(restarted=
 
 
 class TimestampContinuity:
-    """Classifies each frame by its time stamp."""
+    """Classifies each frame by its time stamp: next, duplicate, late, or first after a restart."""
 
     def __init__(self) -> None:
         self._stamp_us: int | None = None

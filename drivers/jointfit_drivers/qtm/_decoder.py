@@ -1,6 +1,6 @@
 """Decoder of servers of Qualisys Track Manager (QTM): converts packets to optical frames.
 
-Every chunk is one packet, received by TCP or as a datagram. A frame that arrives before the
+Every chunk is one packet, received by TCP or as a datagram. A frame that arrives before QTM's
 settings, or that does not fit them, is dropped and counted in `unpublished`.
 
 Invariant: the output depends only on the chunks fed. The decoder reads no clock and no socket.
@@ -83,7 +83,7 @@ class QtmDecoder:
 
     @property
     def tick_clock(self) -> TickClock | None:
-        """Camera time if QTM streams it; otherwise time since the beginning of the measurement."""
+        """Clock of the frames: camera time if QTM streams it, else the time of the measurement."""
         return self._clock
 
     @property
@@ -143,7 +143,7 @@ class QtmDecoder:
     # --- settings and events ------------------------------------------------------------------
 
     def _take_settings(self, xml: str, out: list[Decoded]) -> None:
-        """Assign the columns to the settings; append changes and warnings."""
+        """Store new settings of QTM and their columns; append events about changes and faults."""
         settings = qtm.parse_settings(xml)
         if settings is None:
             out.append(DeviceEvent("warning", "the settings of QTM are not readable XML"))
@@ -265,7 +265,7 @@ class QtmDecoder:
         )
 
     def _ticks(self, frame: CompleteFrame, out: list[Decoded]) -> int | None:
-        """Return the exposure in ticks of the clock in use; the two clocks are never mixed."""
+        """Return the exposure time in ticks of the clock in use; None if the frame has none."""
         component = frame.components.get(ComponentType.TIMECODE)
         codes = component.timecodes if isinstance(component, qtm.TimecodeComponent) else ()
         camera = next((t for code in codes if (t := code.camera_ticks) is not None), None)

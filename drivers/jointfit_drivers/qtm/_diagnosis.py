@@ -2,7 +2,7 @@
 
 | cause | evidence |
 |---|---|
-| QTM is not running, wrong port | the connection is refused, or the answer is not from QTM |
+| QTM is not running, or wrong port | the connection is refused, or the answer is not from QTM |
 | no measurement | QTM answers "no more data", or has no parameters |
 | firewall | frames arrive by TCP, but not by UDP |
 | 6DOF or labels not calculated | frames lack the component, and the settings show the reason |
@@ -59,7 +59,7 @@ async def diagnose(settings: QtmSettings, wait_s: float) -> list[Finding]:
 
 
 async def _receive(settings: QtmSettings, wait_s: float) -> Reception:
-    """Receive frames in the same way as the driver."""
+    """Receive frames in the same way as the driver, and return the reception."""
 
     async def connect(emit: Emit) -> None:
         route = await find_route("QTM", settings)

@@ -44,7 +44,7 @@ class QtmColumns(NamedTuple):
     residuals: Array
     """Residual of each marker, m; NaN if missing or zero."""
     suspicious: int
-    """Number of bodies that have a position but no valid rotation."""
+    """Number of bodies and segments that have a position but no valid rotation."""
 
 
 class QtmPoseConverter:

@@ -68,7 +68,7 @@ async def find_servers(
 
 
 async def _ask_host(settings: QtmSettings, route: Route, wait_s: float) -> list[FoundServer]:
-    """Return the server at an address with the names in its settings; empty if it is silent."""
+    """Return the server at an address with the names in its settings; empty without an answer."""
     described = asyncio.Event()
     found: list[qtm.QtmSettingsXml] = []
 

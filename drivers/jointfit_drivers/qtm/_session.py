@@ -1,4 +1,4 @@
-"""One connection to a QTM server, from its greeting to silence.
+"""One connection to a QTM server, from its start until it is lost or silent.
 
 1. QTM sends a greeting. The session then sends ``Version`` for each version from 1.25 down to 1.19,
    until QTM accepts one.

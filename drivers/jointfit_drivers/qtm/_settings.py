@@ -31,7 +31,7 @@ class QtmSettings(ServerSettings):
         "auto", description="vertical axis of the stream; `auto`: as QTM announces it"
     )
     skeleton: bool = Field(
-        False, description="whether segments of skeletons are bodies, too: `Skeleton/Segment`"
+        False, description="whether segments of skeletons are bodies, too, named `Skeleton/Segment`"
     )
     latency_ms: float = Field(
         10.0, ge=0, le=1000, description="usual delay from exposure to arrival, ms"

@@ -1,4 +1,4 @@
-"""Driver of IMUs on a serial port that rig.toml describes.
+"""Driver of IMUs on a serial port whose messages rig.toml describes.
 
 The driver sends nothing, because a table does not describe how a device is configured. If the
 received data contain no message, the table or the speed is wrong. The error then describes the
@@ -89,7 +89,7 @@ class SerialTableImu:
                 data = b"".join(each.data for each in chunks)
                 found = explain_bytes(data, wire)
                 raise DeviceMisconfiguredError(
-                    f"{port.path}: {received} bytes at {self._settings.baud} baud, and no message "
-                    f"of the table: {found}"
+                    f"{port.path}: {received} bytes at {self._settings.baud} baud contain no "
+                    f"message that the table describes: {found}"
                 )
         return chunks

@@ -42,19 +42,19 @@ def explain_bytes(data: bytes, wire: FrameFormat | LineFormat) -> str:
     if isinstance(wire, LineFormat):
         return _explain_lines(data, wire) if is_text else _NOT_TEXT.format(_hex_text(data))
     if is_text:
-        return f"they are text, such as {data[:_SHOWN]!r}: describe it with `text`, not `frame`"
+        return f"they are text, such as {data[:_SHOWN]!r}: describe them with `text`, not `frame`"
     return _explain_frames(data, wire)
 
 
 def _explain_lines(data: bytes, wire: LineFormat) -> str:
     lines = [line.rstrip(b"\r") for line in data.split(b"\n")[1:-1] if line.strip()]
     if not lines:
-        return "no line ends: expected LF at the end of a line; check `baud`"
+        return "no end of a line found, expected LF: check `baud`"
     example = repr(lines[-1][:60].decode("ascii", "replace"))
     wanted = [line for line in lines if line.startswith(wire.prefix)]
     if not wanted:
         prefix = wire.prefix.decode("ascii", "replace")
-        return f"no line begins with {prefix!r}, such as {example}: correct `text.prefix`"
+        return f"no line begins with {prefix!r}, found {example}: correct `text.prefix`"
 
     separator = _likely_separator(wanted, wire)
     if separator is not None:
@@ -65,7 +65,7 @@ def _explain_lines(data: bytes, wire: LineFormat) -> str:
         remedy = "correct `text.columns` and `column` of the fields"
         return f"lines such as {example} have {found} columns, expected {needed}: {remedy}"
     if wire.checksum is not None:
-        return f"no line has a valid checksum, such as {example}: correct `text.checksum`"
+        return f"no line has a valid checksum, found {example}: correct `text.checksum`"
     return f"a column is not a number in lines such as {example}: correct `column` of the fields"
 
 
@@ -123,7 +123,7 @@ def _explain_frames(data: bytes, wire: FrameFormat) -> str:
 def _length_finding(
     data: bytes, starts: Sequence[int], spacing: int, wire: FrameFormat
 ) -> str | None:
-    """Return the difference between the frame length in the table and in the data."""
+    """Return the difference between the frame length in table and data; None if they agree."""
     if isinstance(wire.length, int):
         if spacing == wire.length:
             return None
@@ -149,7 +149,7 @@ def _is_valid(frame: bytes, checksum: Checksum, wire: FrameFormat) -> bool:
 
 
 def _usual_checksums(sync: int) -> Iterator[Checksum]:
-    """Yield the types of checksums that many devices use."""
+    """Yield checksums that many devices use, for frames that begin with `sync` sync bytes."""
     for first in dict.fromkeys((0, sync, 1, 2, 3)):
         for kind, width in WIDTHS.items():
             orders: tuple[ByteOrder, ...] = ("little", "big") if width > 1 else ("little",)
@@ -185,4 +185,4 @@ def _hex_text(data: bytes) -> str:
     return data[:_SHOWN].hex(" ").upper()
 
 
-_NOT_TEXT = "they are no text, such as {}: check `baud`, or describe them with `frame`, not `text`"
+_NOT_TEXT = "they are not text, found {}: check `baud`, or describe them with `frame`, not `text`"

@@ -58,7 +58,7 @@ class SerialFields(Settings):
     """Quantities of a frame or line."""
 
     quaternion: Parts = Field((), description="orientation")
-    rate: Parts = Field((), description="rate of turn, sensor axes")
+    rate: Parts = Field((), description="angular rate, sensor axes")
     acceleration: Parts = Field((), description="specific force, sensor axes; upwards at rest")
     magnetic: Parts = Field((), description="magnetic field, sensor axes, any unit")
     time: Parts = Field((), description="device time of the measurement")
@@ -69,7 +69,7 @@ class SerialFields(Settings):
 
 
 class NumberSettings(Settings):
-    """An integer of the frame."""
+    """An integer in the frame."""
 
     offset: int = Field(
         ge=0, lt=LONGEST_FRAME, description="first byte of the number in the frame, from 0"
@@ -119,7 +119,7 @@ class FrameSettings(Settings):
     )
     end: str = Field("", description="last bytes of every frame, hexadecimal")
     message: MessageSettings | None = Field(
-        None, description="type of the frame, for devices that send several"
+        None, description="type of the frame, for devices that send several types"
     )
 
     @field_validator("sync", "end")
@@ -166,7 +166,7 @@ class SerialTableSettings(SerialImuSettings, TableImuSettings):
 
     @override
     def contradictions(self) -> Iterator[tuple[str, str]]:
-        """Yield the keys whose fields do not fit the frame."""
+        """Yield the keys that do not fit together, each with its fault."""
         if (self.frame is None) == (self.text is None):
             if self.frame is None:
                 yield "frame", "missing: add a `frame` table (binary) or a `text` table (lines)"

@@ -6,10 +6,10 @@ is the measured sample period:
 | finding                                                  | outcome                          |
 |----------------------------------------------------------|----------------------------------|
 | c = round(d / P) within 1 % and two counts               | same clock; c - 1 samples lost   |
-| no counter; d is not negative, and it is either short or | same clock; round(d / P) - 1     |
-| equal to the step of the arrival times                   | samples lost                     |
-| no time; c is not negative, and it is plausible          | c - 1 samples lost               |
-| none of the above                                        | the sample is held               |
+| no counter; d is not negative, and is short or equal to  | same clock; round(d / P) - 1     |
+| the step of the arrival times                            | samples lost                     |
+| no time; c is not negative, and fits the arrival times   | c - 1 samples lost               |
+| none of the above                                        | the sample is held for the next  |
 | the next sample continues the held one                   | the device restarted             |
 | the next sample continues the last accepted one          | the held one was corrupt         |
 
@@ -32,8 +32,8 @@ _LATE_NS = 500_000_000
 """Largest difference between device time and arrival time over a gap, ns."""
 _LATE_SHARE = 0.02
 _AMBIGUOUS = 0.05
-"""Share of the counter's values. If the tolerance of a step is larger, the counter confirms
-nothing."""
+"""Largest tolerance with which the counter can confirm a step, as a share of the number of the
+counter's values."""
 _FASTER = 4.0
 """Largest factor by which buffered messages may arrive faster than their rate."""
 
@@ -42,7 +42,7 @@ class RecordStep(NamedTuple):
     """Classification of one sample."""
 
     lost: int = 0
-    """Number of samples lost before this sample, or before the held sample if it is confirmed."""
+    """Number of samples lost before this sample; 0 if the held sample is confirmed."""
     restarted: bool = False
     """Whether the device restarted before the held sample."""
     held: bool = False
@@ -110,7 +110,7 @@ class RecordContinuity:
         return RecordStep(restarted=True, confirmed=True, lost_since=max(since - 1, 0))
 
     def _samples(self, last: _Point, point: _Point) -> int | None:
-        """Return the number of samples from `last` to `point`; None if they do not follow."""
+        """Return the number of samples from `last` to `point`; None if `point` does not follow."""
         c = self._count(last, point)
         if last.ticks is None or point.ticks is None:
             return self._count_by_counter(c, point.arrival_ns - last.arrival_ns)
@@ -137,7 +137,10 @@ class RecordContinuity:
         return c if abs(c - expected) <= slack else None
 
     def _learn(self, d: int, c: int | None) -> int | None:
-        """Return the number of samples in one of the first steps; update the measured period."""
+        """Return the number of samples in one of the first steps; None if the step is too long.
+
+        The step contributes to the measured period.
+        """
         most = _SHORT * self._period_ns / self._tick_ns
         if d > most or (c is not None and c > _SHORT):
             return None

@@ -15,7 +15,7 @@ _MOST_BYTES = 4095
 
 
 def check_hexadecimal(text: str) -> str:
-    """Return a text that contains bytes in hexadecimal.
+    """Return `text` unchanged if it contains bytes in hexadecimal.
 
     Raises
     ------
@@ -71,8 +71,8 @@ class FieldSettings(Settings):
         None,
         gt=1,
         description="for time and counter: number of values before they begin at 0 again; "
-        "default: all values of an integer type; in text lines 2^32 for a time in us or ms; "
-        "otherwise none",
+        "default: number of values of an integer type; in text lines 2^32 for a time in us or ms; "
+        "otherwise the values never begin again",
     )
     mask: int | None = Field(None, gt=0, description="for valid: bits that are evaluated")
     equals: int | None = Field(
@@ -107,12 +107,13 @@ class ChecksumSettings(Settings):
     first: int = Field(
         0,
         ge=0,
-        description="first included byte of the frame; the last one is the byte before the "
-        "checksum",
+        description="first byte of the frame that the checksum includes; the last one is the byte "
+        "before the checksum",
     )
     byte_order: Literal["little", "big"] | None = Field(
         None,
-        description="default: `byte_order` of the table; `little` for fletcher16: plain sum first",
+        description="default: `byte_order` of the table. For fletcher16, `little` means that the "
+        "plain sum comes first",
     )
     polynomial: int | None = Field(
         None,
@@ -130,7 +131,7 @@ class ChecksumSettings(Settings):
         return Checksum(**keys | {"byte_order": self.byte_order or byte_order})
 
     def faults(self) -> list[tuple[str, str]]:
-        """Return the keys whose values exceed the width of the checksum."""
+        """Return the keys whose values exceed the width of the checksum, each with its fault."""
         if None in (self.kind, self.init, self.xor_out):
             return []
         most = 1 << 8 * WIDTHS[self.kind]
@@ -149,7 +150,7 @@ class TableImuSettings(GatewaySettings):
     )
     world: Literal["ENU", "NED", "NWU"] = Field(
         "ENU",
-        description="directions of the x, y and z axis of the device's world: E east, N north, W "
+        description="directions of the x, y and z axes of the device's world: E east, N north, W "
         "west, U up, D down",
     )
     direction: Literal["sensor_to_world", "world_to_sensor"] = Field(

@@ -1,7 +1,7 @@
 r"""Search for settings of a table that fit the data, if the configured settings do not.
 
 Quaternions have the norm 1, and specific forces have the norm of gravity most of the time. If byte
-order or type are wrong, the norms of the raw counts vary. If only the scale is wrong, the norms are
+order or type is wrong, the norms of the raw counts vary. If only the scale is wrong, the norms are
 constant, and their median is the scale.
 
 Invariant: the result depends only on the received numbers.
@@ -24,16 +24,17 @@ if TYPE_CHECKING:
     from jointfit_protocols.table import Quantity, TableField
 
 _NEAR = {"quaternion": 0.02, "acceleration": 0.3}
-"""Largest relative deviation from the median norm. Accelerations include motion."""
+"""Largest relative deviation of a norm that counts as near the median. Accelerations include
+motion."""
 _SHARE = 0.8
-"""Smallest share of norms near the median with a correct byte order and type."""
+"""With a correct byte order and type, at least this share of the norms is near the median."""
 _DIVISORS = (
     1.0, 100.0, 256.0, 1000.0, 1024.0, 2048.0, 4096.0, 8192.0, 10_000.0, 16_384.0, 32_767.0,
     32_768.0, 100_000.0, 1_000_000.0, float(1 << 30), float((1 << 31) - 1),
 )  # fmt: skip
 """Numbers of counts per unit that devices use."""
 _SNAP = {"quaternion": 0.01, "acceleration": 0.12}
-"""Largest relative deviation of a measured number of counts per unit from one of `_DIVISORS`, with
+"""Largest relative deviation of a measured number of counts per unit from one of `_DIVISORS` at
 which this divisor replaces the measured number."""
 _KNOWN_SCALE = 1e-9
 
@@ -84,7 +85,10 @@ def fitting_keys(
 def _candidates(
     fields: Sequence[TableField],
 ) -> Iterator[tuple[dict[str, str], list[TableField]]]:
-    """Yield combinations of type and byte order, beginning with the configured combination."""
+    """Yield the changed keys and the fields of each combination of type and byte order.
+
+    The first combination is the configured one.
+    """
     first = fields[0]
     kinds = dict.fromkeys((first.kind, "i", "f" if first.bits in {32, 64} else "i"))
     orders = dict.fromkeys((first.byte_order, "little", "big"))

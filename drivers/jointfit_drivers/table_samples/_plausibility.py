@@ -1,4 +1,6 @@
-"""Checks of a table against the first data: scale, byte order, type and units, with the remedy.
+"""Checks of a table against the first data: scale, byte order, type and units.
+
+A finding contains the remedy.
 
 Invariant: the result depends only on the records fed. Every check reports at most once.
 """
@@ -21,12 +23,12 @@ if TYPE_CHECKING:
 _CHECKED = 100
 """Number of records after which scale and byte order are checked."""
 _ROUND = 0.05
-"""Largest deviation of the median norm of quaternions from 1."""
+"""Largest deviation of the norm of a quaternion from 1."""
 _LIGHT, _HEAVY = 6.0, 14.0
-"""Plausible range of the median specific force, m/s^2. Outside this range, the scale is wrong."""
+"""Plausible range of the norm of a specific force, m/s^2."""
 _GOOD, _CALM = 0.75, 0.5
-"""Smallest shares, for a correct table, of quaternions and of specific forces whose norm is in
-range."""
+"""Smallest shares of quaternions and of specific forces whose norm is in range. With smaller
+shares, the table is wrong."""
 _TIMED = 200
 """Number of records after which the unit of device time is checked."""
 _TIMED_NS = 2_000_000_000

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Vector
 
 _STEPS = 300
-"""Number of steps between two computations of the slope."""
+"""Number of steps (pairs of successive readings) between two computations of the slope."""
 _MOST_STEPS = 6000
 """Number of steps after which the check ends if the sensor hardly rotated."""
 _EXPLAINED = 0.5
@@ -30,7 +30,8 @@ _EXPLAINED = 0.5
 _LOW, _HIGH = 0.6, 1.7
 """Range of k in which the unit counts as correct."""
 _FREE = 0.3
-"""Largest relative deviation of the specific force from gravity for a step."""
+"""Largest relative deviation of the norm of the specific force from gravity, for both readings of a
+step."""
 _LONGEST_S = 0.1
 """Longest duration of a step, s."""
 
@@ -82,7 +83,7 @@ class RateUnitCheck:
                 self.slope = slope
 
     def fitting_unit(self, configured: float) -> str | None:
-        """Return the unit for which k is near 1; `configured` is the current unit in rad/s."""
+        """Return the unit for which k is near 1; `configured` is the configured unit in rad/s."""
         if self.slope is None:
             return None
         for unit, si in UNITS["rate"].items():

@@ -2,7 +2,7 @@
 
 Invariant: the output depends only on the records. The module reads no clock and no port. A record
 with an orientation becomes one sample, or is rejected with a reason. For raw measurements, the
-filter returns no sample while it settles.
+orientation filter returns no sample while it settles.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from jointfit_protocols.orientation import Quaternion
 
 _COARSE = 1e-4
-"""Smallest value of one count with which rounding changes the norm of a quaternion noticeably."""
+"""Smallest value of one count at which rounding changes the norm of a quaternion noticeably."""
 _TOLERANCE, _COARSE_TOLERANCE = 0.01, 0.05
 _RECHECK = 100
 """Number of rejected records after which the settings are checked again. After each check the
@@ -66,7 +66,7 @@ class RecordSamples(Refusals):
         self._acceleration = self._places.get("acceleration")
         self._magnetic = self._places.get("magnetic")
         self._raw = self._new_filter()
-        self._raw_ns, self._raw_at = 0, -1  # time without wraps, ns, and its ticks
+        self._raw_ns, self._raw_at = 0, -1  # last reading: time without wraps, and ticks
         self._limits = [_limits(form, slot) for slot in measured]
         self._scales = form.scales
         self._zeros = form.zeros if any(form.zeros) else None
@@ -205,7 +205,7 @@ class RecordSamples(Refusals):
 
     def _si(self, values: Sequence[float | None]) -> tuple[float, ...]:
         """Return the measured components of a record in SI units."""
-        # Measured components are never None. The shorter sequence ends the product.
+        # Measured components are never None. `map` ends with the shorter sequence.
         si: Iterator[float] = map(mul, cast("Sequence[float]", values), self._scales)
         return tuple(si) if self._zeros is None else tuple(map(add, si, self._zeros))
 

@@ -1,4 +1,7 @@
-"""Records of a device that a table describes, and the meaning of the numbers in them."""
+"""Records of a device that a table describes, and the meaning of the numbers in them.
+
+A *slot* is the index of one component of one quantity (`jointfit_protocols.table.SLOTS`).
+"""
 
 from __future__ import annotations
 

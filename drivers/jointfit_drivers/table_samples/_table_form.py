@@ -269,8 +269,8 @@ def _clock(form: TableForm, *, is_text: bool) -> tuple[TickClock | None, float |
         return TickClock(1000, wrap), per_count
 
     modulus = part.modulus or (None if place.bits == _ALL_BITS else place.modulus)
-    # The tick is an integer number of ns, or an integer number of ticks per second, whichever is
-    # nearer.
+    # The tick is expressed as an integer number of ns, or as an integer number of ticks per second,
+    # whichever is nearer to the configured unit.
     tick_ns = abs(place.scale) * 1e9
     whole, rate = round(tick_ns), round(1e9 / tick_ns)
     if rate == 0 or (whole and abs(whole / tick_ns - 1) <= abs(rate * tick_ns * 1e-9 - 1)):

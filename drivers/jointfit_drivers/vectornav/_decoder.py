@@ -48,7 +48,8 @@ _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _SMALL = 1e-4
 """Largest difference between a rotation matrix and the identity that counts as no rotation."""
 _NEWEST = NewestKnown((3,), "VectorNav Control Center")
-"""Newest supported firmware: that of the VN-100 in 2024. Versions of other models are lower."""
+"""Newest supported firmware: the version of the VN-100 in 2024. Other models have lower
+versions."""
 
 
 class _Places:
@@ -121,7 +122,7 @@ class VectorNavDecoder(SerialMessageDecoder[VectorNavMessage]):
     @override
     def _take_corrupt(self, found: CorruptBytes) -> list[Decoded]:
         out = super()._take_corrupt(found)
-        if found.reason == UNKNOWN_HEADER:  # noise rarely repeats a size
+        if found.reason == UNKNOWN_HEADER:  # noise rarely has the same size twice
             content = f"binary outputs of {found.discarded} bytes with an unknown header"
             out += self._newer.take_unknown(content, self._stamps.chunk_ns)
         return out
@@ -198,7 +199,7 @@ def _text_events(message: TextMessage) -> Iterator[Decoded]:
         if not all(abs(found - expected) <= _SMALL for found, expected in pairs):
             text = (
                 f"a reference frame rotation is stored (register 26: {data['reference_frame']}): "
-                "sensor axes are not the printed ones. Reset it with VectorNav Control Center "
-                "before calibration, or leave it as it is"
+                "the sensor axes differ from the printed axes. Reset the rotation with VectorNav "
+                "Control Center before a calibration, or leave it unchanged"
             )
             yield DeviceEvent("warning", text, data)

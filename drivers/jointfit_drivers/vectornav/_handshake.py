@@ -3,8 +3,8 @@
 The driver reads registers, and writes only registers that differ. Written values are volatile:
 without ``persist``, the device returns to its stored values at the next power-up. A fault that may
 end without a change of the settings raises `DeviceLostError`. All other faults raise
-`DeviceMisconfiguredError`. The driver then requests the device to resume; registers that were
-already written keep their new values until the next power-up.
+`DeviceMisconfiguredError`. Before this error, the driver requests the device to resume; registers
+that were already written keep their new values until the next power-up.
 """
 
 from __future__ import annotations
@@ -200,7 +200,7 @@ class VectorNavHandshake:
 
 
 def _is_sufficient(found: BinaryOutput | None, wanted: BinaryOutput) -> bool:
-    """Return whether an output is sent on both ports, at the rate, with the required fields."""
+    """Return whether an output has the wanted ports and rate, and contains all wanted fields."""
     if found is None or found[:2] != wanted[:2]:
         return False
     return set(wanted.fields) <= set(found.fields)

@@ -54,7 +54,7 @@ class RateCheck:
         imu_hz = rate_hz * divisor
         text = (
             f"sends at {rate_hz:.4g} Hz, expected {self._rate_hz:g} with divisor {divisor}: its "
-            f"IMU runs at {imu_hz:.0f} Hz: set rate_hz = {rate_hz:.4g}, or IMU rate "
-            f"{self._rate_hz * divisor:.0f} with VectorNav Control Center"
+            f"IMU runs at {imu_hz:.0f} Hz: set rate_hz = {rate_hz:.4g}, or set the IMU rate to "
+            f"{self._rate_hz * divisor:.0f} Hz with VectorNav Control Center"
         )
         return DeviceEvent("warning", text, {"rate_hz": round(rate_hz, 2)})

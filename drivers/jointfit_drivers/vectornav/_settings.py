@@ -12,7 +12,7 @@ from jointfit_drivers.serial_imu import SerialImuSettings
 from jointfit_protocols.vectornav import BinaryLayout, Field, Fields
 
 _FRAME_BYTES = 3
-"""Number of bytes of a frame without its payload: sync byte and CRC."""
+"""Number of bytes of a message without its header and payload: sync byte and CRC."""
 _ORIENTATION = (Field.TIME_STARTUP, Field.QUATERNION)
 _RAW = (Field.TIME_STARTUP, Field.ANGULAR_RATE, Field.ACCELERATION)
 

@@ -4,8 +4,8 @@ A subject with a single segment is a prop, whose body has the name of the subjec
 other subjects are bodies with names such as ``Anna/LeftThigh``. Each subject has its own range of
 ids.
 
-Invariant: the module is pure. A name in rig.toml selects the same marker or segment when the server
-assigns other ids or lists its subjects in another order.
+Invariant: the module is pure. A name in rig.toml selects the same marker or segment even if the
+server assigns other ids or lists its subjects in another order.
 """
 
 from __future__ import annotations

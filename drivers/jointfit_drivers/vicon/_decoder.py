@@ -135,7 +135,7 @@ class ViconDecoder:
     # --- static objects -----------------------------------------------------------------------
 
     def _take_static(self, out: list[Decoded]) -> None:
-        """Append the changes of subjects, axis, period and quality."""
+        """Apply changes of subjects, axis, period and quality; append their events."""
         application = _first(self._state.static(ObjectId.APPLICATION_INFO), vicon.ApplicationInfo)
         axis = "y" if application is not None and application.orientation == _Y_UP else "z"
         if self._up_axis == "auto" and axis != self._axis:
@@ -157,7 +157,7 @@ class ViconDecoder:
                 self._report_quality(item, out)
 
     def _bind(self, subjects: tuple[vicon.SubjectInfo, ...], out: list[Decoded]) -> ViconBinding:
-        """Assign the columns to the subjects; append changes and warnings."""
+        """Return the columns for the subjects; append events about changes and faults."""
         binding = bind_subjects(subjects, self._wanted_markers, self._wanted_bodies)
         before = None if self._binding is None else self._binding.columns
         columns, events = renew_columns(before, binding.columns)

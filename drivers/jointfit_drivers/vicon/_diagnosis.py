@@ -84,7 +84,7 @@ async def diagnose(settings: ViconSettings, wait_s: float) -> list[Finding]:
 
 
 async def _receive(settings: ViconSettings, limit_s: float) -> Reception:
-    """Receive frames in the same way as the driver."""
+    """Receive frames in the same way as the driver, and return the reception."""
 
     async def connect(emit: Emit) -> None:
         await ViconSession(settings, await find_route("Vicon", settings), emit).run()

@@ -1,4 +1,4 @@
-"""Delay from exposure to arrival, as far as the server announces this delay.
+"""Delay from exposure to arrival: announced processing time plus half the round trip of a ping.
 
 The server sends neither the time of exposure nor a clock. LatencyInfo contains the durations of the
 processing stages, and the round-trip time of a ping is an upper bound of the network delay.
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from jointfit_protocols.vicon import LatencyInfo
 
 _LONGEST_S = 1.0
-"""Longest plausible sum of the stages, and largest age of a ping that is used, s."""
+"""Longest plausible sum of the durations of the stages, and longest round-trip time of a ping that
+is used, s."""
 _SUMS = 101
 """Number of recent frames from which the median of the sums is computed."""
 _PINGS = 20
@@ -27,7 +28,7 @@ _EVERY = 32
 
 
 class AnnouncedLatency:
-    """Median of the announced delay, and half the round-trip time of pings."""
+    """Median of the announced delay, and half the mean round-trip time of pings."""
 
     def __init__(self) -> None:
         self._sums_ns: deque[int] = deque(maxlen=_SUMS)
@@ -43,7 +44,7 @@ class AnnouncedLatency:
 
     @property
     def uncertainty_ns(self) -> int:
-        """Half of the round-trip time plus the spread of the sums, ns."""
+        """Half of the round-trip time plus the standard deviation of the sums, ns."""
         spread = statistics.pstdev(self._sums_ns) if len(self._sums_ns) > 1 else 0.0
         return round(self._half_trip_ns + spread)
 

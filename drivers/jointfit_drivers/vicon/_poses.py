@@ -115,7 +115,7 @@ def _global_poses(state: SceneState) -> tuple[dict[int, Pose], int]:
 def _chained_poses(
     state: SceneState, parents: dict[int, dict[int, int]]
 ) -> tuple[dict[int, Pose], int]:
-    """Return the global poses computed from local poses, and the number of rejected poses."""
+    """Return the global poses that follow from light-weight poses, and the number of rejections."""
     poses: dict[int, Pose] = {}
     suspicious = 0
     for item in state.dynamic(ObjectId.LIGHT_SEGMENTS):

@@ -1,4 +1,4 @@
-"""One connection to a Vicon DataStream server, from its offer to silence.
+"""One connection to a Vicon DataStream server, from its start until it is lost or silent.
 
 1. The server sends the ids of the objects that it offers. The driver answers with the ids that it
    requires.

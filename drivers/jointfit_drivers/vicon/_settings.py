@@ -21,7 +21,7 @@ class ViconSettings(ServerSettings):
         "auto", description="vertical axis of the stream; `auto`: as the server announces it"
     )
     least_quality: float = Field(
-        0.2, ge=0, le=1, description="quality of a subject below which a warning is given"
+        0.2, ge=0, le=1, description="quality of a subject below which the driver warns"
     )
     latency_ms: float = Field(
         2.0,

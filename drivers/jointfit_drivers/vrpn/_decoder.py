@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from jointfit_drivers.vrpn._settings import VrpnSettings
 
 _STEP_US = 100_000
-"""Smallest difference between elapsed server time and arrival time that is a step of the server's
-clock, µs."""
+"""Smallest difference between elapsed server time and arrival time that counts as a step of the
+server's clock, µs."""
 _PACE_US = 250_000
 """Time with messages at the server's own rate after which their delay is known, µs."""
 _LATEST_US = 1_000_000
@@ -55,7 +55,7 @@ _MOST_BODIES = 2000
 """Largest number of bodies per server. Further bodies are dropped, because each takes memory."""
 _DESCRIBING = (vrpn.Cookie, vrpn.SenderDescription, vrpn.TypeDescription)
 _MOST_DESCRIBED_BYTES = 1_000_000
-"""Largest size of the kept chunks that describe the connection, bytes."""
+"""Largest size of the stored chunks that describe the connection, bytes."""
 _NEWEST = NewestKnown((vrpn.MAJOR, vrpn.MINOR), "the camera software", "VRPN")
 _CLOCKS = {"server": TickClock(1000, None), "utc": TickClock(1000, None, None, "unix")}
 
@@ -238,8 +238,8 @@ class VrpnDecoder:
             return
         advance_us, elapsed_us = frame.time_us - last[0], now_us - last[1]
         delay_us = self._delay.limit(_PACE_US, _LATEST_US)
-        # If less server time than arrival time elapsed, the network has a delay, unless time
-        # decreased.
+        # If less server time than arrival time elapsed, the network delayed the message. A decrease
+        # of server time is always a step.
         if 0 <= advance_us <= elapsed_us + delay_us + _STEP_US:
             self._delay.feed(advance_us, elapsed_us)
             return
@@ -258,7 +258,8 @@ class VrpnDecoder:
         if before is not None and not self._stale_binding:
             return before
 
-        # These are the bodies that have sent reports, and the described bodies that rig.toml names.
+        # The columns are the bodies that have sent reports, and the described bodies that rig.toml
+        # names.
         wanted = {**self._wanted_markers, **self._wanted_bodies}
         described = set(self._codec.senders.values())
         keys = dict(self._bodies)

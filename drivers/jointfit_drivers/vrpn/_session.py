@@ -1,10 +1,10 @@
-"""One connection to a VRPN server, from the cookie to silence.
+"""One connection to a VRPN server, from its start until it is lost or silent.
 
-1. The session opens a TCP connection to the server. In the classic form, it announces itself by UDP
-   twice, 2 s apart, and the server connects back.
+1. The session opens a TCP connection to the server. With ``connection = "classic"``, it announces
+   itself by UDP twice, 2 s apart, and the server connects back.
 2. Both sides send a cookie that contains their version. Other major versions are refused.
 3. With ``transport = "udp"``, the session sends the UDP port for poses.
-4. Poses follow. After half of `silence_s` without a pose, the session requests answers, at
+4. Poses follow. After half of `silence_s` without a pose, the session sends pings, at
    intervals of at most 1 s. The error message can then name the cause: no server, or no visible
    body.
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 CONNECT_S = 3.0
 """Longest wait for the connection, and for the cookie, s."""
 ANNOUNCE_S, ANNOUNCEMENTS = 2.0, 2
-"""Interval between the announcements of the classic form, s, and number of announcements."""
+"""Interval between the announcements of a classic connection, s, and number of announcements."""
 _PING_S = 1.0
 _TYPES = {vrpn.PING: 0, vrpn.PONG: 1}
 _SENDER = 0
@@ -155,7 +155,7 @@ class VrpnSession:
         if self._cookie is None:
             raise DeviceLostError(
                 f"{self._name}: accepts connections, but sends nothing within {CONNECT_S:g} s: "
-                "restart the camera software, and check that port is that of its VRPN server"
+                "restart the camera software, and check that `port` belongs to its VRPN server"
             )
         major, minor, _ = self._cookie
         if major != vrpn.MAJOR:
@@ -184,7 +184,7 @@ class VrpnSession:
             self._link.wake()
 
     async def _stream(self, link: VrpnLink) -> None:
-        """Wait until the stream ends."""
+        """Wait, and raise the error that ends the stream: silence, or an invalid message."""
         began_ns = time.monotonic_ns()
         silence_s, pinged = self._settings.silence_s, False
         while True:
@@ -211,7 +211,7 @@ class VrpnSession:
         """Return the error for a server that sends no poses, with the probable cause."""
         self._output.silent = True
         if self._pong_ns > self._pose_ns:
-            cause = "it answers, but sends no body: bring the bodies into view, or start streaming"
+            cause = "it answers, but sends no pose: bring the bodies into view, or start streaming"
         elif not self._codec.senders:
             cause = "it has described no body: create rigid bodies and start streaming"
         else:

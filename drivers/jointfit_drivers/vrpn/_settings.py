@@ -13,8 +13,8 @@ from jointfit_protocols.vrpn import DEFAULT_PORT
 class VrpnSettings(ServerSettings):
     """The ``[mocap]`` table for every system with a VRPN server.
 
-    A tracker with one sensor has the name of the tracker. Sensor 3 of the tracker ``Leg`` is
-    ``Leg#3``.
+    The body of a tracker with one sensor has the name of the tracker. The body of sensor 3 of the
+    tracker ``Leg`` has the name ``Leg#3``.
     """
 
     port: int = Field(DEFAULT_PORT, ge=1, le=65535, description="port of the server")

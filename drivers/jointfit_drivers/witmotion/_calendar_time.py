@@ -28,7 +28,7 @@ class CalendarTime:
         self._reading_ns = 0
 
     def accept(self, ticks: int | None, arrival_ns: int) -> int | None:
-        """Return the time of a sample, ms since 2000; None if the time is a glitch.
+        """Return the time of a sample, ms since 2000; None if the time is missing or a glitch.
 
         Parameters
         ----------
@@ -52,7 +52,7 @@ class CalendarTime:
         return ticks
 
     def reading_ns(self, ticks: int | None, period_ns: float) -> int:
-        """Return the time of a raw reading, ns since the first reading.
+        """Return the continuous time of a raw reading, ns. The zero of this time is arbitrary.
 
         Parameters
         ----------

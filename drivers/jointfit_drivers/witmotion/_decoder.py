@@ -41,7 +41,8 @@ if TYPE_CHECKING:
 _CHECKED_FRAMES = 100
 """Number of frames after which missing kinds are reported. They contain at least ten samples."""
 _OTHER_FRAMES = 3
-"""Number of frames that identify the variant 55 61. Noise may contain one such frame by chance."""
+"""Number of frames with the start bytes 55 61 that identify this variant of devices. Noise may
+contain one such frame by chance."""
 _MOST_COUNT = 32_700
 """Smallest absolute count of an acceleration or rate that is out of range."""
 _SCALE = 1.0 / FULL_SCALE
@@ -228,7 +229,7 @@ class WitMotionDecoder:
         if not missing:
             return []
         text = f"it sends {kind_names(self._kinds)}, but no {kind_names(missing)}"
-        return [DeviceEvent("warning", f"{text}: the driver enables it when it opens the device")]
+        return [DeviceEvent("warning", f"{text}: the driver enables these frames at its start")]
 
 
 def missing_kinds(received: set[int], raw: RawSamples | None) -> set[int]:

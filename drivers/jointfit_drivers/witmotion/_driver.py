@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class WitMotionImu:
-    """One WitMotion device, stamped on arrival or with the device's calendar time."""
+    """One WitMotion device. Samples have the time of arrival or the device's calendar time."""
 
     Settings: ClassVar[type[WitMotionSettings]] = WitMotionSettings
     wire: ClassVar[Wire] = "stream"

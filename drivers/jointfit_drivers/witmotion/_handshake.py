@@ -1,9 +1,9 @@
 """Start of a WitMotion device: the driver requests the required frames, or raises an error.
 
 The device does not acknowledge writes. The driver first listens, and reads the settings if the
-firmware answers. If content or rate differ, it writes both, and listens again. The written
-registers are lost at power-off. The driver writes the flash memory, or changes the speed of the
-device, only if ``persist`` permits it.
+firmware answers. If the content (the kinds of frames) or the rate differs, it writes both, and
+listens again. The written registers are lost at power-off. The driver writes the flash memory, or
+changes the speed of the device, only if ``persist`` permits it.
 
 Source: protocol pages of the vendor. The unlock command permits access for 10 s, and commands must
 be separated by 100 ms.
@@ -55,7 +55,7 @@ _ANSWER_S = 0.3
 _COMMAND_PAUSE_S = 0.1
 """Pause after each command, which the vendor requires, s."""
 _ENOUGH = 2
-"""Number of frames of each required kind that prove that the device sends the kind."""
+"""Number of frames of a required kind that prove that the device sends this kind."""
 _LEAST_RATE = 0.7
 """Share of `rate_hz` below which the measured rate counts as different."""
 _LOGGED_BYTES = 20 * FRAME_BYTES
@@ -69,7 +69,7 @@ class _Reception(NamedTuple):
     received: int
     """Number of received bytes."""
     other_frames: int
-    """Number of frames of the variant 55 61."""
+    """Number of frames with the start bytes 55 61, which other variants of the device send."""
     seconds: float
     registers: tuple[int, int, int, int] | None
     """Content of a received register frame; None if none was received."""
@@ -159,7 +159,7 @@ class WitMotionHandshake:
         return _Reception(counts, codec.fed, codec.other_frames, seconds, registers)
 
     async def _read_settings(self) -> tuple[int, int, int, int] | None:
-        """Return content, rate, speed and next register; None if the firmware does not answer."""
+        """Return the registers content, rate, speed and the next one; None without an answer."""
         await self._port.write(read_register(WitMotionRegister.CONTENT))
         answer = await self._listen(_ANSWER_S, lambda c: WitMotionFrameKind.REGISTERS in c)
         return answer.registers
@@ -245,9 +245,8 @@ class WitMotionHandshake:
             if found.other_frames:
                 raise DeviceMisconfiguredError(f"{self._path}: {OTHER_VARIANT}")
         raise DeviceMisconfiguredError(
-            f"{self._path}: {received} bytes, none of them a WitMotion frame at any usual speed: "
-            "correct `port` or `driver`, which "
-            "`jointfit probe` recognizes"
+            f"{self._path}: {received} bytes, but no WitMotion frame at any usual speed: "
+            "correct `port` or `driver`; `jointfit probe` recognizes the device on a port"
         )
 
     async def _move_from(self, baud: int) -> _Reception:

@@ -20,7 +20,7 @@ class WitMotionSettings(SerialImuSettings, GatewaySettings):
 
     world: Literal["ENU", "NED", "NWU"] = Field(
         "ENU",
-        description="directions of the x, y and z axis of the device's world: E east, N north, W "
+        description="directions of the x, y and z axes of the device's world: E east, N north, W "
         "west, U up, D down; the vendor does not document them, `jointfit probe --physical-test` "
         "determines them",
     )

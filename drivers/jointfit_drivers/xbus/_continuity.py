@@ -1,13 +1,13 @@
-"""Counter and clock of an Xbus device: lost messages, restarts, and undetected corruption.
+"""Counter and clock of an Xbus device: losses, restarts, and corruption that passed the checksum.
 
 An orientation *follows* another orientation if counter and device time advanced together. If only
-one of them is sent, it must have advanced by a few periods. Every MTData2 message increments the
-counter. Only messages with an orientation are compared, because others may contain the time of
-another clock (GNSS).
+one of them is sent, it must have advanced by at most a few periods. Every MTData2 message
+increments the counter. Only messages with an orientation are compared, because others may contain
+the time of another clock (GNSS).
 
 | orientation                                   | outcome                                         |
 |-----------------------------------------------|-------------------------------------------------|
-| follows the last accepted orientation         | accepted; skipped counter values were lost      |
+| follows the last accepted orientation         | accepted; skipped counts are lost messages      |
 | does not follow                               | held until the next orientation                 |
 | the next follows the last accepted one        | the held one is corrupt and is dropped          |
 | the next follows the held one                 | both accepted; a restart if device time agrees  |
@@ -195,7 +195,7 @@ class XbusContinuity:
     def _follows(self, last: _OrientationPoint, point: _OrientationPoint) -> bool:
         ticks, counts = self._ticks(last, point), _counts(last, point)
         if (ticks is None) != (last.ticks is None) or (counts is None) != (last.counter is None):
-            return False  # the fields of `point` differ from those before
+            return False  # `point` and `last` have different fields
 
         few = _SLACK_COUNTS + 1
         if ticks is None:
@@ -212,7 +212,7 @@ class XbusContinuity:
         return self._sum_ticks / self._sum_counts
 
     def _ticks(self, last: _OrientationPoint, point: _OrientationPoint) -> int | None:
-        """Return the step of time without wraps; None if one of the points has no time."""
+        """Return the step of device time, wraps removed; None if one of the points has no time."""
         if last.ticks is None or point.ticks is None:
             return None
         step = point.ticks - last.ticks

@@ -66,7 +66,7 @@ class XbusConversation:
         that passed the checksum."""
 
     def reset(self) -> None:
-        """Discard received bytes, here and in the port, for another speed or a new start."""
+        """Discard the bytes received so far, for example before another speed is used."""
         self._port.flush_input()
         self._decoder, self._recent = XbusCodec(), b""
         self.received = self.understood = 0
@@ -178,7 +178,7 @@ class XbusConversation:
 
 
 def _is_certain(message: XbusMessage) -> bool:
-    """Return whether address, identifier and content also identify an Xbus message."""
+    """Return whether a message with a valid checksum certainly comes from an Xbus device."""
     if message.bid not in {MASTER, _OTHER_ADDRESS} or message.mid not in _KNOWN:
         return False
     return message.mid != XbusMessageId.MT_DATA2 or bool(mtdata2.split(message.data))

@@ -98,7 +98,7 @@ class XbusDecoder:
         Filter that computes orientations from raw measurements; None if the device sends
         orientations.
     legacy : LegacyMeasurements, optional
-        Fields of MTData messages; None for a device that sends MTData2 messages.
+        Reader of MTData messages; None for a device that sends MTData2 messages.
     bus_id : int, optional
         Bus id of the device whose measurements are used. None selects the device that sends the
         first measurement.

@@ -158,8 +158,8 @@ class XbusHandshake:
         reply = await self._answer(XbusMessageId.OUTPUT_CONFIGURATION)
         if reply.mid == XbusMessageId.ERROR and reply.data[:1] == _UNKNOWN_MESSAGE:
             raise DeviceMisconfiguredError(
-                f"{self._path}: does not support output configurations, like older devices: set "
-                'format = "mtdata"'
+                f"{self._path}: does not support output configurations, so it is an older device: "
+                'set format = "mtdata"'
             )
         found = _outputs_of(reply)
         faults = output_differences(found, rate, self._triggers, self._needs)
@@ -195,8 +195,8 @@ class XbusHandshake:
         """Raise an error that lists the necessary changes, unless ``persist`` permits them."""
         if not self._settings.persist:
             raise DeviceMisconfiguredError(
-                f"{self._path}: {'; '.join(faults)}{hint}: set persist = true once to write it "
-                "into the device's flash, or configure the device with MT Manager"
+                f"{self._path}: {'; '.join(faults)}{hint}: set persist = true once to write "
+                "the settings into the device's flash, or configure the device with MT Manager"
             )
 
     async def _ensure_sync(self) -> None:
@@ -269,13 +269,16 @@ class XbusHandshake:
                 "`port`"
             )
         raise DeviceMisconfiguredError(
-            f"{self._path}: the device on this port is not Xbus: it sends bytes, none of them "
-            "Xbus at any common speed: correct `port` or `driver`, which "
-            "`jointfit probe` recognizes"
+            f"{self._path}: the device on this port is not Xbus: it sends bytes, but no Xbus "
+            "message at any common speed: correct `port` or `driver`; `jointfit probe` recognizes "
+            "the device on a port"
         )
 
     async def _other_speed(self) -> int | None:
-        """Return the speed at which the device answers; the device then continues to measure."""
+        """Return the speed at which the device answers; None if it does not answer.
+
+        The device then continues to measure.
+        """
 
         async def answers() -> bool:
             answered = await self._conversation.enter_config(tries=1, wait_s=_LISTEN_S)
@@ -366,7 +369,7 @@ def _hz(rate: int) -> str:
 
 
 def _rate_hint(found: tuple[setup.Output, ...], needs: tuple[RequiredOutput, ...]) -> str:
-    """Return a hint to the device's own rate, if this rate alone resolves the differences."""
+    """Return a hint to use the device's rate as `rate_hz`, if this removes all differences."""
     rates = {output.rate for output in found if output.data_id & 0xFFF0 in needs[0].items}
     rate = next(iter(rates), 0)
     if rate in {0, setup.MAX_RATE} or output_differences(found, rate, (), needs):

@@ -1,8 +1,8 @@
-"""Measurements of older devices: MTData messages, whose fields depend on output mode and settings.
+"""Measurements of older devices: MTData messages, whose fields depend on two device settings.
 
-The device reports output mode and settings in its replies during the handshake. For a capture
-without the handshake, rig.toml defines them. Euler angles and matrices are converted to
-quaternions.
+The device reports the two settings, output mode and output settings, in its replies during the
+handshake. For a capture without the handshake, rig.toml defines them. Euler angles and matrices are
+converted to quaternions.
 
 Invariant: the result depends only on the messages fed.
 """

@@ -17,7 +17,7 @@ _ITEM_HEAD, _FLOAT = 3, 4
 
 
 class RequiredOutput(NamedTuple):
-    """One required output."""
+    """One required output: alternative data items, and their name in singular and plural."""
 
     items: tuple[Item, ...]
     one: str

@@ -64,7 +64,7 @@ class XbusSettings(GatewaySettings, SerialImuSettings):
         None,
         ge=0,
         le=0xFFFF_FFFF,
-        description="format of MTData messages; default: as the device reports",
+        description="format of MTData messages; default: as the device reports it",
     )
     legacy_world: Literal["NWU", "ENU"] = Field(
         "NWU",
@@ -74,12 +74,12 @@ class XbusSettings(GatewaySettings, SerialImuSettings):
 
     @override
     def contradictions(self) -> Iterable[tuple[str, str]]:
-        """Yield keys that devices with MTData messages do not permit."""
+        """Yield the keys that do not fit the configured `format`, each with its fault."""
         yield from super().contradictions()
         if self.format != "mtdata":
             for key in ("output_mode", "output_settings"):
                 if getattr(self, key) is not None:
-                    yield key, 'only MTData has it: set format = "mtdata", or remove it'
+                    yield key, 'only MTData has this key: set format = "mtdata", or remove the key'
             return
         if self.orientation == "gateway":
             yield "orientation", 'MTData has no device time: set orientation = "device"'
@@ -99,7 +99,7 @@ class XbusSettings(GatewaySettings, SerialImuSettings):
     @field_validator("rate_hz")
     @classmethod
     def _rate_the_device_can_run_at(cls, rate_hz: float) -> float:
-        """Reject rates that are not an integer number of Hz."""
+        """Reject rates that are not an integer number of Hz, or are above `MAX_RATE_HZ`."""
         if rate_hz != int(rate_hz) or rate_hz > MAX_RATE_HZ:
             raise ValueError(f"expected whole Hz up to {MAX_RATE_HZ}, found {rate_hz:g}")
         return rate_hz

@@ -6,9 +6,9 @@ SampleTime per group:
 
 | finding                                                 | outcome                             |
 |---------------------------------------------------------|-------------------------------------|
-| c = round(d / P) within 1 % and a few counts            | same clock; c - 1 groups were lost  |
+| c = round(d / P) within 1 % and two counts              | same clock; c - 1 groups were lost  |
 | no counter, d forward by a few P                        | same clock; round(d / P) - 1 lost   |
-| d or c backward, only one of them 0, or disagreement    | contradiction: the group is held    |
+| d or c backward, only one of them 0, or they disagree   | contradiction: the group is held    |
 | the next group continues the held one                   | restart, unless SampleTime          |
 |                                                         | continued or followed host time, or |
 |                                                         | a backlog ended                     |
@@ -16,9 +16,9 @@ SampleTime per group:
 | three contradictions that continue each other, or       | two sensors share the identifiers   |
 | 14 broken groups, within 20 groups                      |                                     |
 
-The line of an adapter has no checksum, so a single group does not prove a restart. A sensor that is
-reset contradicts the previous groups once. Two sensors with the same identifiers contradict each
-other continuously. Their groups cannot be separated, so no group is used.
+The serial line of a CAN adapter has no checksum, so a single group does not prove a restart. A
+sensor that is reset contradicts the previous groups once. Two sensors with the same identifiers
+contradict each other continuously. Their groups cannot be separated, so no group is used.
 
 Invariant: the result depends only on the values fed, and every input is accepted.
 """
@@ -63,6 +63,7 @@ class XcdiStep(NamedTuple):
     """Classification of one group."""
 
     lost: int = 0
+    """Number of groups lost since the last accepted group; a held group is not lost."""
     restarted: bool = False
     """Whether the sensor restarted before the held group."""
     shared: bool = False

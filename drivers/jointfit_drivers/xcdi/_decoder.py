@@ -2,7 +2,7 @@
 
 The stamp of a sample is the arrival of the first frame in its group, because arbitration may delay
 the later frames. A record of 24 bytes is a message of this sensor, a frame of another device, a
-note of the host, or a rejected record.
+count of losses on the host, or a rejected record.
 
 Invariant: the output depends only on the chunks fed. The decoder reads no clock and no bus.
 """
@@ -78,7 +78,7 @@ class XcdiDecoder:
 
     @property
     def discarded_bytes(self) -> int:
-        """Number of bytes in rejected records, and on an adapter's line that formed no frame."""
+        """Number of bytes in rejected records, plus bytes on an adapter's line outside frames."""
         return self._bus.discarded_bytes
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
@@ -233,12 +233,12 @@ def _native(group: XcdiGroup) -> Quaternion:
 
 
 _NO_TIME = (
-    f"{_TIMELESS} quaternions, and no SampleTime: samples are stamped on arrival; set "
+    f"{_TIMELESS} quaternions without SampleTime: samples are stamped on arrival; set "
     "`ids.sample_time`, or switch the output on (over UART, Xsens MT Manager)"
 )
 _OVERFLOWED = "its output buffer overflowed, frames are lost: lower its rate or raise the bit rate"
 _SHARED = (
     "counters and times contradict each other: two sensors use the same CAN identifiers, so "
-    "none of their samples is used: give each sensor its own block (over UART, Xsens MT Manager) "
-    "and set `ids`"
+    "none of their samples is used: give each sensor identifiers of its own (over UART, Xsens MT "
+    "Manager) and set `ids`"
 )

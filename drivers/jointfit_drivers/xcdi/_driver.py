@@ -75,7 +75,7 @@ class XcdiIdSettings(Settings):
             yield (
                 "",
                 f"found {found}; expected sample_time < group_counter < quaternion: the lowest "
-                "identifier leaves first, and the quaternion must be the last frame of a sample. "
+                "identifier is sent first, and the quaternion must be the last frame of a sample. "
                 "Set all three as in the device",
             )
 
@@ -105,11 +105,11 @@ class XcdiSettings(CanImuSettings):
     )
     extended_ids: bool = Field(
         False,
-        description="29-bit identifiers even if the numbers fit 11 bits",
+        description="use 29-bit identifiers even if the numbers fit 11 bits",
     )
     sample_time_unit: Literal["auto", "100us", "1us"] = Field(
         "auto",
-        description="unit of SampleTime; auto: from ticks per sample and rate_hz",
+        description="unit of SampleTime; auto: determined from ticks per sample and rate_hz",
     )
     byte_order: Literal["big", "little"] = Field("big", description="byte order of the payloads")
 
@@ -147,9 +147,10 @@ class XcdiImu:
     def candidate_tables(cls, seen: Mapping[tuple[int, bool], int]) -> Iterator[dict[str, Any]]:
         """Yield the identifiers of sensors that may have sent the received frames.
 
-        A candidate is a Quaternion (8 bytes), the nearest lower GroupCounter (2 bytes) and the
-        nearest lower SampleTime (4 bytes), because a sensor needs ascending identifiers. Each
-        candidate is tried with both byte orders. See `jointfit_daemon.device_search`.
+        A candidate consists of a frame of 8 bytes (Quaternion), the frame of 2 bytes with the next
+        lower identifier (GroupCounter), and the frame of 4 bytes with the next lower identifier
+        (SampleTime). The identifiers of a sensor must be in this order. Each candidate is tried
+        with both byte orders. See `jointfit_daemon.device_search`.
         """
         for (quaternion, extended), size in sorted(seen.items()):
             if size != _SAMPLE_BYTES[DataId.QUATERNION]:

@@ -1,6 +1,6 @@
 """Time and motion of an x-IMU3: lost messages, restarts, and corruption that no checksum detects.
 
-A message *follows* the last accepted message if its time advances by a few periods and its
+A message *follows* the last accepted message if its time advances by at most a few periods and its
 orientation continues the motion. Three messages have the orientations q0, q1 and q2 and the times
 t0, t1 and t2. Their deviation from a uniform motion, as an angle in rad, is
 
@@ -11,12 +11,12 @@ the limit.
 
 | message                                       | outcome                                          |
 |-----------------------------------------------|--------------------------------------------------|
-| follows the last accepted message             | accepted; skipped periods were lost              |
+| follows the last accepted message             | accepted; skipped periods are lost messages      |
 | does not follow                               | held until the next message                      |
 | the next follows the last accepted one        | the held one is corrupt and is dropped           |
-| the next is a few periods and a possible      | both accepted; a restart if device time did not  |
-| rotation after the held one                   | advance like the arrival times                   |
-| the next is neither                           | the held one is dropped, the next one is held    |
+| the next is at most a few periods after the   | both accepted; a restart if device time did not  |
+| held one, and the rotation is possible        | advance like the arrival times                   |
+| none of the above                             | the held one is dropped, the next one is held    |
 
 Invariant: the result depends only on the values fed, and every input is accepted. During a motion
 within the range of the gyroscope, a message is delayed by at most one message, and two successive
@@ -160,7 +160,7 @@ class XImu3Continuity:
         if held.q is None or point.q is None:
             return True
 
-        # The angle between the orientations is twice the chord.
+        # The angle between the orientations is about twice the distance of the quaternions.
         sign = 1.0 if sum(a * b for a, b in zip(held.q, point.q, strict=True)) >= 0.0 else -1.0
         square = sum((a - sign * b) ** 2 for a, b in zip(held.q, point.q, strict=True))
         return 2.0 * sqrt(square) <= _FASTEST * 1e-6 * passed + _JOLT

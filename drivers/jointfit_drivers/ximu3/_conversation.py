@@ -48,7 +48,7 @@ class XImu3Conversation:
         return self._certain >= _CERTAIN
 
     def reset(self) -> None:
-        """Discard received bytes, here and in the port, for another speed or a new start."""
+        """Discard the bytes received so far, for example before another speed is used."""
         self._line.reset()
         self._certain = 0
 

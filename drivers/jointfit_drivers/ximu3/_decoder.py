@@ -53,7 +53,7 @@ _UNUSABLE = {
 _NEWEST = NewestKnown((1,), "the x-IMU3 GUI")
 """Newest supported firmware: the newest that API 1.9 of the vendor's software can read."""
 _OLD_PULSE_US = 10_000_000
-"""Largest difference, us, between an edge and the last measurement."""
+"""Largest difference between the time of an edge and the time of the last measurement, us."""
 _LONGEST_VERSION = 32
 
 
@@ -199,7 +199,8 @@ class XImu3Decoder(SerialMessageDecoder[XImu3Data | XImu3Reply]):
         if native is None or q is None:
             return []
 
-        # A dropped quaternion may have changed the sign, so the sign of the last sample is used.
+        # The sign is aligned with the last sample, because a dropped quaternion may have changed
+        # it.
         (a, b, c, d), (w, x, y, z) = self._q, q
         if a * w + b * x + c * y + d * z < 0.0:
             q = (-w, -x, -y, -z)
@@ -207,7 +208,7 @@ class XImu3Decoder(SerialMessageDecoder[XImu3Data | XImu3Reply]):
         return [ImuSample(arrived_ns, q, native, message.ticks, None)]
 
     def _sync_pulse(self, message: XImu3Data) -> list[Decoded]:
-        """Return the pulse of an edge that must be reported."""
+        """Return the pulse of an edge in the configured direction; empty for other edges."""
         wire, edge = self._settings.sync_wire, message.values[0] != 0.0
         if wire is None or edge != (self._settings.sync_edge == "rising"):
             return []

@@ -101,7 +101,7 @@ class DeviceReports:
     def _world_events(self, value: object) -> list[Decoded]:
         if type(value) is not int or not 0 <= value < len(WORLDS):
             text = (
-                f"ahrs_axes_convention is {_text_of(value)}, expected 0, 1 or 2: {self.world} used"
+                f"ahrs_axes_convention is {_text_of(value)}, expected 0, 1 or 2: using {self.world}"
             )
             return [DeviceEvent("warning", text)]
         world, before, known = WORLDS[value], self.world, self._world_known

@@ -1,9 +1,9 @@
 """Start of an x-IMU3: the driver checks the required settings, or raises an error with the cause.
 
 The driver reads the settings of the device. It changes a setting only if the setting differs and
-``persist`` permits the change, because the device also saves its settings when it is switched off.
-A fault that may end without a change of the settings raises `DeviceLostError`. All other faults
-raise `DeviceMisconfiguredError`.
+``persist`` permits the change. Every change is permanent, because the device saves its settings
+when it is switched off. A fault that may end without a change of the settings raises
+`DeviceLostError`. All other faults raise `DeviceMisconfiguredError`.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ class XImu3Handshake:
             firmware = found.get("firmware_version", "unknown")
             raise DeviceMisconfiguredError(
                 f"{self._path}: firmware {firmware} does not have {', '.join(needed)}: "
-                "install another one with the x-IMU3 GUI, or set passive = true"
+                "install another firmware with the x-IMU3 GUI, or set passive = true"
             )
         return found
 
@@ -129,7 +129,7 @@ class XImu3Handshake:
         if not self._settings.persist:
             raise DeviceMisconfiguredError(
                 f"{self._path}: {text}{rate_hint(found, self._required)}: set persist = true once "
-                "to write it into the device, or change it with the x-IMU3 GUI"
+                "to write the settings into the device, or change them with the x-IMU3 GUI"
             )
         log.warning("%s: writing its settings: %s", self._settings.id, text)
 
@@ -175,9 +175,9 @@ class XImu3Handshake:
                 "serial interface of a new x-IMU3 is disabled: set serial_mode = 1 over USB once"
             )
         raise DeviceMisconfiguredError(
-            f"{self._path}: the device on this port is not an x-IMU3: it sends bytes, none of them "
-            "its messages at a common speed: correct `port` or `driver`, which "
-            "`jointfit probe` recognizes"
+            f"{self._path}: the device on this port is not an x-IMU3: it sends bytes, but none of "
+            "its messages at a common speed: correct `port` or `driver`; `jointfit probe` "
+            "recognizes the device on a port"
         )
 
     async def _other_speed(self) -> int | None:

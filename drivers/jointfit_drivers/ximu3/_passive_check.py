@@ -56,7 +56,7 @@ async def ensure_expected_messages(
 
     if not kinds:
         raise DeviceMisconfiguredError(
-            f"{settings.port}: {codec.fed} bytes at {settings.baud} baud, none of them messages of "
+            f"{settings.port}: {codec.fed} bytes at {settings.baud} baud, but no message of "
             "an x-IMU3: correct `baud`, `port` or `driver`"
         )
     if on_gateway:

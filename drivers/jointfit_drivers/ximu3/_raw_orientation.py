@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
 _DEGREE = radians(1.0)
 _OLDEST_US = 1_000_000
-"""Age above which a field is not used, us, because the magnetometer was switched off."""
+"""Age above which a field is not used, us. At this age, the magnetometer was probably switched
+off."""
 
 
 class XImu3RawOrientation:

@@ -16,13 +16,13 @@ WORLD = "ahrs_axes_convention"
 REPORTED = (
     "firmware_version", "hardware_version", WORLD, "axes_alignment", "ahrs_ignore_magnetometer",
 )  # fmt: skip
-"""Settings that are read because they affect the meaning of the measurements."""
+"""Settings that are always read, because the decoder reports or needs their values."""
 _SERIAL_MODES = ("disabled", "normal", "accessory")
 _MESSAGE_TYPES = (
     "quaternion", "rotation matrix", "Euler angles", "linear acceleration", "earth acceleration",
 )  # fmt: skip
 _MAGNETIC_DIVISORS = (1, 2)
-"""Divisors of the base rate of 20 Hz, with which the magnetometer sends at 20 or 10 Hz."""
+"""Divisors of the magnetometer's rate of 20 Hz. With them, it sends at 20 or 10 Hz."""
 
 
 class RequiredSetting(NamedTuple):
@@ -83,7 +83,7 @@ def differences(
 
 
 def rate_hint(found: Mapping[str, object], required: tuple[RequiredSetting, ...]) -> str:
-    """Return a hint to the device's own rate, if this rate alone resolves the differences."""
+    """Return a hint to use the device's rate as `rate_hz`, if this removes all differences."""
     faults = differences(found, required)
     key = next(iter(faults), "")
     divisor = found.get(key)

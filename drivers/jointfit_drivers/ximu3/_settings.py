@@ -35,17 +35,18 @@ class XImu3Settings(GatewaySettings, SerialImuSettings):
     world: Literal["NWU", "ENU", "NED"] = Field(
         "NWU",
         description="with `passive`: world of the device (its `ahrs_axes_convention`); otherwise "
-        "it is read from the device",
+        "the driver reads the world from the device",
     )
     axes_alignment: int | None = Field(
         None,
         ge=0,
         le=23,
-        description="required `axes_alignment` of the device; default: any, which is reported",
+        description="required `axes_alignment` of the device; default: any value; it is reported",
     )
     ignore_magnetometer: bool | None = Field(
         None,
-        description="required `ahrs_ignore_magnetometer` of the device; default: any, reported",
+        description="required `ahrs_ignore_magnetometer` of the device; default: any value; it is "
+        "reported",
     )
     sync_wire: int | None = Field(
         None, ge=0, description="number of the rig's sync wire at the sync input of the accessory"

@@ -81,16 +81,16 @@ async def test_the_other_mode_is_named(tmp_path: Path) -> None:
     bno = device(tmp_path, checks_speed=True)
     bno.intervals[5] = 10_000
     text = await refusal(tmp_path, bno, 115_200)
-    assert "none of them a frame of UART-RVC" in text
+    assert "bytes at 115200 baud, but no UART-RVC frame" in text
     assert "for UART-SHTP set baud = 3000000" in text
 
 
 async def test_a_silent_line_is_a_lost_device(tmp_path: Path) -> None:
     bno = device(tmp_path, mode="rvc")
     async with serving(bno):
-        with pytest.raises(DeviceLostError, match="PS0 is high and PS1 low"):
+        with pytest.raises(DeviceLostError, match="PS0 is high and PS1 is low"):
             await make(tmp_path, 115_200).run(lambda _: None)
-        with pytest.raises(DeviceLostError, match="PS1 is high and PS0 low"):
+        with pytest.raises(DeviceLostError, match="PS1 is high and PS0 is low"):
             await make(tmp_path, 3_000_000).run(lambda _: None)
 
 

@@ -179,7 +179,7 @@ def test_heartbeats_report_a_start_and_a_stop_once() -> None:
     found = fed(LpmsCanDecoder(settings()), beats)
     assert [(e.kind, e.text[:32]) for e in found if isinstance(e, DeviceEvent)] == [
         ("restart", "device restarted (its heartbeat "),
-        ("warning", "its heartbeat reports state 4, e"),
+        ("warning", "the heartbeat of the sensor repo"),
     ]
 
 
@@ -259,7 +259,7 @@ async def test_overlapping_identifiers_of_neighbours_are_refused_by_name(tmp_pat
     )
     run = DriverRun(LpmsCanImu(first))
     await asyncio.sleep(0.05)
-    with pytest.raises(DeviceMisconfiguredError, match=r"0x516 .*also that of S1.*LpmsControl"):
+    with pytest.raises(DeviceMisconfiguredError, match=r"0x516 .*also used by S1.*LpmsControl"):
         await LpmsCanImu(second).run(lambda _: None)
     await run.cancel()
 

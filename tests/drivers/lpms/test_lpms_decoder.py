@@ -197,7 +197,7 @@ def test_float_seconds_that_nothing_announces_are_reported() -> None:
     ]
     assert len(samples(fed(decoder(1, device_time="seconds"), seconds(20.0)))) == 700
     back = fed(decoder(1, device_time="seconds"), [packet(n, 4 * n) for n in range(700)])
-    assert texts(back, "warning") == ['device time is no float seconds: set device_time = "ticks"']
+    assert texts(back, "warning") == ['device time is not float seconds: set device_time = "ticks"']
 
 
 ORDERS = {  # from the vendor's register lists: values before and after the quaternion
@@ -274,7 +274,7 @@ def test_packets_of_another_length_are_reported_once_with_both_lengths() -> None
     under_test = decoder()
     found = fed(under_test, [wire] * 10)
     (text,) = texts(found, "warning")
-    assert text.startswith("data packets of 36 bytes, expected 20 (32 bit) or 12 (16 bit)")
+    assert text.startswith("data packets have 36 bytes, expected 20 (32 bit) or 12 (16 bit)")
     assert (under_test.messages, under_test.discarded_bytes) == (10, 0)
 
 
@@ -293,9 +293,9 @@ def test_outputs_that_the_sensor_names_are_skipped() -> None:
 def test_text_and_another_address_are_reported_once() -> None:
     found = fed(decoder(), [b"100,0.5,0.5,0.5,0.5\r\n"] * 40)
     (text,) = texts(found, "warning")
-    assert text.startswith("it sends text: set its output format to LP-BUS")
+    assert text.startswith("the sensor sends text: set its output format to LP-BUS")
     found = fed(decoder(), [encode(9, packet(0)[7:-4], 5)] * 3)
-    assert texts(found, "warning") == ["sends as sensor id 5, expected 1: set `sensor_id`"]
+    assert texts(found, "warning") == ["the sensor has sensor id 5, expected 1: set `sensor_id`"]
     assert len(samples(found)) == 3
 
 

@@ -262,7 +262,7 @@ def test_markers_of_the_same_name_are_told_apart_by_their_object() -> None:
 def test_a_changed_number_of_channels_is_named_after_reconnection() -> None:
     feed = Feeder([*marker("T1"), *marker("T2")], markers={"thigh": ["T1", "T2"]})
     feed.connect(marker("T1"))
-    assert "had 6 channels and has 3 since it was connected again" in feed.texts("warning")
+    assert "had 6 channels and has 3 since the new connection" in feed.texts("warning")
     assert "marker 'T2' (mocap.markers.thigh) is not in the stream" in feed.texts("warning")
     assert feed(1.0, 2.0, 3.0).layout.markers == ("T1",)
 

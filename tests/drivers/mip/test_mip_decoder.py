@@ -83,7 +83,7 @@ def test_among_timed_orientations_those_without_time_are_rejected_and_reported_o
     found = decoded(wires)
     assert len(samples(found)) == 10
     assert sum(isinstance(one, Corrupt) for one in found) == 10
-    assert "same decimation" in events_of(found, "warning")[0].text
+    assert "orientation's decimation" in events_of(found, "warning")[0].text
     assert len(events_of(found, "warning")) == 1
 
 

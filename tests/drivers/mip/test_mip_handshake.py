@@ -87,7 +87,7 @@ async def test_a_rate_that_is_no_fraction_is_refused_with_those_that_are(tmp_pat
         text = await refusal(MipImu(settings(tmp_path, rate_hz=120)))
         await asyncio.sleep(0.05)
         assert device.streaming, "it continues as before"
-    assert "120 Hz is no whole fraction of the 500 Hz" in text
+    assert "120 Hz is not the 500 Hz" in text
     assert "500, 250, 125, 100" in text
 
 

@@ -88,11 +88,11 @@ FAULTS: dict[str, tuple[dict[str, Any], Any, Before, dict[str, Any], str, str]] 
         "correct the names",
     ),
     "newer bitstream": (
-        {"bitstream": (5, 0)}, None, edit, {}, "bitstream 5.0, the newest known one is 4.2",
+        {"bitstream": (5, 0)}, None, edit, {}, "bitstream 5.0, the newest known version is 4.2",
         'bitstream = "4.1"',
     ),
     "paused": ({}, SEEN, paused, {}, "playback paused", "live mode"),
-    "recording": ({}, SEEN, edit, {}, "those of a recording", "live mode"),
+    "recording": ({}, SEEN, edit, {}, "from a recording", "live mode"),
     "cameras paused": ({}, SEEN, standing, {}, "stands still", "resume"),
     "hidden": (
         {}, HIDDEN, lambda _: None, {"rigid_body": {"thigh": "Thigh"}}, "was not tracked", "view",
@@ -155,7 +155,7 @@ OTHER = card("eth1", "10.0.0.5")
         ("192.168.1.5", "192.168.1.5", [ETH, OTHER], None),
         ("10.0.0.5", "192.168.1.5", [ETH, OTHER], "wrong interface"),
         ("10.0.0.5", "10.0.0.5", [OTHER], "another subnet"),
-        ("192.168.1.5", "192.168.1.5", [ETH, WLAN], "two interfaces"),
+        ("192.168.1.5", "192.168.1.5", [ETH, WLAN], "several interfaces"),
     ],
 )
 def test_the_choice_of_the_network_card_is_checked(

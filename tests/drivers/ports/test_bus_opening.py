@@ -87,8 +87,8 @@ async def test_a_cancelled_opening_ends_at_once() -> None:
         ([], "found '', expected the greeting"),
         (
             [b"< hi >", b"< error could not open bus >"],
-            "found '< error could not open bus >' after opening can0, expected '< ok >': let the "
-            "server serve it (`socketcand -i can0`), or correct `channel`",
+            "found '< error could not open bus >' after opening can0, expected '< ok >': start the "
+            "server for this bus (`socketcand -i can0`), or correct `channel`",
         ),
     ],
 )

@@ -309,7 +309,7 @@ async def test_one_identifier_for_two_devices_names_both(tmp_path: Path) -> None
     async with serving(device):
         first = DriverRun(xcdi_driver("S3", bus))
         await opened(adapter)
-        with pytest.raises(DeviceMisconfiguredError, match=r"0x\d+.*S3.*block of its own"):
+        with pytest.raises(DeviceMisconfiguredError, match=r"0x\d+.*S3.*identifiers of its own"):
             await DriverRun(xcdi_driver("S4", bus)).task
         device.push(0, IDENTITY)
         await first.wait_for(1)

@@ -55,7 +55,7 @@ def sent(form: FrameFormat | LineFormat) -> bytes:
             "frames have the type 4, expected 7: correct `frame.message.equals`",
         ),
         (FRAME, LINE, "they are text"),
-        (LINE, FRAME, "they are no text"),
+        (LINE, FRAME, "they are not text"),
         (LINE._replace(prefix=b"$"), LINE, "no line begins with '$'"),
         (LINE, LINE._replace(separator=b";", prefix=b"Q,"), "set `text.separator` = ';'"),
         (LINE._replace(width=6), LINE, "have 4 columns, expected 6: correct `text.columns`"),

@@ -78,7 +78,7 @@ async def test_a_rate_that_is_no_fraction_is_refused_with_those_that_are(tmp_pat
         text = await refusal(VectorNavImu(settings(tmp_path, rate_hz=120)))
         await asyncio.sleep(0.05)
         assert device.streaming, "it continues as before"
-    assert "120 Hz is no whole fraction of the 800 Hz of VN-100S-CR" in text
+    assert "120 Hz is not the 800 Hz of VN-100S-CR divided by an integer" in text
     assert "set rate_hz to one of 800, 400, 200, 160" in text
 
 

@@ -92,7 +92,7 @@ async def test_diagnosis_of_a_server_without_poses_names_the_remedy() -> None:
 
 @pytest.mark.parametrize(
     ("answers", "cause"),
-    [(True, "it answers, but sends no body"), (False, "bring the bodies into view")],
+    [(True, "it answers, but sends no pose"), (False, "bring the bodies into view")],
 )
 async def test_a_silent_server_is_asked_whether_it_still_answers(
     *, answers: bool, cause: str

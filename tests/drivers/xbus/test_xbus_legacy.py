@@ -155,7 +155,7 @@ async def test_a_wrong_configuration_is_named_and_not_written(
         ({"orientation": "gateway"}, "MTData has no device time"),
         ({"persist": True}, "is never written"),
         ({"sync": []}, "sync lines need MTData2"),
-        ({"format": "mtdata2", "output_mode": 6}, "only MTData has it"),
+        ({"format": "mtdata2", "output_mode": 6}, "only MTData has this key"),
     ],
 )
 def test_keys_that_mtdata_does_not_allow_are_refused(keys: dict[str, Any], text: str) -> None:

@@ -235,7 +235,7 @@ async def test_a_passive_driver_names_the_settings_that_send_the_expected_messag
 async def test_a_passive_driver_names_a_wrong_speed_and_silence(tmp_path: Path) -> None:
     async with serving(device(tmp_path, baud=460_800), feeding=True):
         text = await refusal(make(tmp_path, passive=True))
-    assert "none of them messages of an x-IMU3: correct `baud`" in text
+    assert "but no message of an x-IMU3: correct `baud`" in text
     async with serving(device(tmp_path)):
         assert "silent for 0.5 s" in await refusal(make(tmp_path, passive=True), DeviceLostError)
 
