@@ -1,4 +1,4 @@
-"""Optional methods of drivers, which find devices or name the cause of missing data.
+"""Optional driver methods that find devices or name the cause of missing data.
 
 ``jointfit probe``, ``jointfit doctor`` and ``jointfit init`` call these methods. A driver class may
 implement any of them; the commands skip drivers without the method.
@@ -79,7 +79,7 @@ class CanSearch(Protocol):
         ----------
         seen
             Number of data bytes of the frames with each received identifier. A key consists of the
-            identifier and whether the identifier has 29 bits.
+            identifier and a flag, which is true if the identifier has 29 bits.
         """
 
 
@@ -110,12 +110,12 @@ class ServerSearch(Protocol):
 
 
 class Diagnosis(Protocol):
-    """Method of a driver that names the cause of missing data."""
+    """Driver method that names the cause of missing data."""
 
     @classmethod
     async def diagnose(cls, settings: Any, wait_s: float) -> list[Finding]:
-        """Return the findings for the device of a table of rig.toml; `wait_s` limits the wait.
+        """Return the findings for the device that one table of rig.toml describes.
 
-        The method opens the device in the same way as the daemon. Errors of the device become
-        findings, not exceptions.
+        The method opens the device in the same way as the daemon, and waits for at most `wait_s`.
+        Errors of the device become findings, not exceptions.
         """

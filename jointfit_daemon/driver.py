@@ -6,7 +6,8 @@ only rigs that use it.
 
 A driver has two parts. ``decoder()`` returns the pure part: it converts chunks to samples in SI
 units, without clock or port. ``run(emit)`` opens and configures the device, and reads until
-cancelled. The daemon feeds every emitted chunk to a new decoder; a replay feeds recorded chunks.
+cancelled. The daemon creates a decoder when a source opens, and feeds all emitted chunks to it. A
+replay feeds the recorded chunks to a decoder instead.
 """
 
 from __future__ import annotations
@@ -43,8 +44,8 @@ ENTRY_POINT_GROUP = "jointfit.drivers"
 """Entry point group in which a package registers its drivers."""
 
 Emit = Callable[[Chunk], None]
-"""Function that passes one chunk to the daemon synchronously. A driver must not catch its
-exceptions, because they are bugs."""
+"""Function that passes one chunk to the daemon synchronously. A driver must not catch exceptions of
+this function, because they are bugs."""
 
 Wire = Literal["stream", "datagram", "can"]
 """Content of a chunk: any part of a byte stream, one datagram, or a sequence of CAN records."""
@@ -69,9 +70,9 @@ class DeviceAbsentError(DeviceLostError):
 class DeviceMisconfiguredError(Exception):
     """The device cannot work with these settings; the message names the setting to change.
 
-    The source pauses for at most a minute. It continues earlier after a reload, or if another
-    device appears on its port. Raise `DeviceLostError` for faults that can end without a change of
-    the settings: a port in use, no free file descriptor, or a bus that is down.
+    The source pauses for at most a minute. It continues earlier after a reload of rig.toml, or if
+    another device appears on its port. Raise `DeviceLostError` for faults that can end without a
+    change of the settings: a port in use, no free file descriptor, or a bus that is down.
     """
 
 
@@ -100,12 +101,12 @@ CONTRADICTION = "contradiction"
 
 
 class CanBusError(ValueError):
-    """A ``[can.NAME]`` table cannot be used on this machine. Validators of drivers raise it.
+    """A ``[can.NAME]`` table cannot be used on this machine; raised by validators of drivers.
 
     Parameters
     ----------
     faults
-        Fault and remedy of each wrong key of the table.
+        Text with the fault and its remedy for each wrong key of the table.
     """
 
     def __init__(self, faults: Mapping[str, str]) -> None:
@@ -192,7 +193,7 @@ class CanBusSettings(Settings):
     transport: Literal["usb", "uart"] = Field(
         "usb",
         description="port of an SLCAN adapter: `usb` transfers without delay, whatever `baud` is; "
-        "for a `uart` stamps are back-dated by the duration of the received bytes at `baud`",
+        "for a `uart`, the duration of the received bytes at `baud` is subtracted from the stamps",
     )
 
     @field_validator("channel")
@@ -235,14 +236,14 @@ class ImuSettings(Settings):
     least_delay_ms: tuple[float, float] | None = Field(
         None,
         description="smallest delay from measurement to arrival and its standard deviation, ms; "
-        "default: that of the transport",
+        "default: the values of the transport",
     )
     lag_ms: float | None = Field(
         None,
         ge=-1000,
         le=1000,
         description="known lag, ms: stamp of this sensor minus stamp of the cameras for the same "
-        "event; the motion only checks it",
+        "event; the lag that the daemon estimates from motion then only serves as a check",
     )
     lag_sd_ms: float = Field(0.1, gt=0, le=100, description="standard deviation of `lag_ms`, ms")
 
@@ -255,7 +256,8 @@ class ImuSettings(Settings):
     def can_frames(self) -> tuple[tuple[int, bool], ...]:
         """CAN frames of one sample.
 
-        Each is given by its number of data bytes and whether its identifier has 29 bits.
+        Each item consists of the number of data bytes of a frame, and a flag that is true if the
+        identifier of the frame has 29 bits.
         """
         return ()
 
@@ -292,8 +294,8 @@ class MocapSettings(Settings):
 def device_path(settings: object) -> str | None:
     """Return the device file or network interface in the settings of a driver.
 
-    It is the `port`, or the channel of the CAN bus. Without both, for example for a network device,
-    return None.
+    It is the `port`, or the channel of the CAN bus. The result is None for settings that have
+    neither, such as the settings of a network device.
     """
     found = getattr(settings, "port", None) or getattr(
         getattr(settings, "can", None), "channel", None
@@ -310,9 +312,9 @@ class Decoder(Protocol):
 
     If data cannot be decoded without earlier messages, such as the list of marker names, a decoder
     has an attribute ``description`` of type tuple of bytes: the newest messages that describe the
-    data, in the order in which a new decoder needs them. A recording that starts later begins with
-    them. Without this attribute, it begins with the chunks that arrived before the first
-    measurement.
+    data, in the order in which a new decoder needs them. A recording that starts while the driver
+    runs begins with these messages. Without this attribute, such a recording begins with the chunks
+    that arrived before the first measurement.
     """
 
     @property
@@ -387,7 +389,7 @@ def driver_names() -> list[str]:
 
 
 def find_driver(name: str) -> type[Driver]:
-    """Return the driver class registered as `name`; imports no other driver.
+    """Return the driver class registered as `name`, without importing other drivers.
 
     Raises
     ------

@@ -52,7 +52,7 @@ class TickClock(NamedTuple):
     """Exact tick rate, 1/s, if the period is not a whole number of nanoseconds (NatNet)."""
     scale: Literal["own", "monotonic", "unix"] = "own"
     """Origin of the time base: arbitrary (``own``), CLOCK_MONOTONIC of this host, or UNIX time that
-    PTP synchronizes between device and host. The last two are declared in the configuration."""
+    PTP synchronizes between device and host. ``monotonic`` and ``unix`` come from rig.toml."""
 
 
 class ImuSample(NamedTuple):
@@ -236,7 +236,7 @@ class Chain:
     conventions: tuple[AngleConvention | None, ...] = ()
     """Configured angle convention of each joint; None if the name of the joint selects it."""
     parents: tuple[int | None, ...] = ()
-    """Number of the proximal segment of each joint, None for O1. The tuple is empty for a limb
+    """Index of the proximal segment of each joint, None for O1. The tuple is empty for a limb
     without branches."""
     left_joints: tuple[bool, ...] = ()
     """Whether each joint is on the left side; empty if ``left_side`` holds for all joints."""
@@ -248,7 +248,7 @@ class Chain:
 class JointAngles(NamedTuple):
     """Three angles of a joint, rad, in the order of its `AngleConvention`.
 
-    The field names are those of the convention ``flexion``. CONVENTIONS.md defines the signs.
+    The fields are named for the convention ``flexion``. CONVENTIONS.md defines the signs.
     """
 
     flexion: float
@@ -284,7 +284,7 @@ class JointState(NamedTuple):
     convention: AngleConvention = AngleConvention.FLEXION
     """Definition of `angles` and `rates`."""
     proximal: int | None = None
-    """Number of the joint's proximal segment in a branched limb. None means the segment before the
+    """Index of the joint's proximal segment in a branched limb. None means the segment before the
     joint."""
 
 
@@ -335,7 +335,7 @@ class FrameFlag(StrEnum):
 
 
 class LimbState(NamedTuple):
-    """State of the limb at ``t_ns``. Every frame has one, even if no sensor has data."""
+    """State of the limb at ``t_ns``. Every frame has a limb state, even if no sensor has data."""
 
     seq: int
     t_ns: int
@@ -411,8 +411,8 @@ class OpticalJoint(NamedTuple):
 class RunningCenter(NamedTuple):
     """Center of rotation of one joint, estimated from the most recent camera frames.
 
-    Coordinates are those of the proximal body part. The origin is the mean of the part's markers.
-    The axes are those of the segment, or of the static pose for a part without sensors.
+    The coordinate frame moves with the proximal body part. Its origin is the mean of the part's
+    markers. Its axes are the axes of the segment, or of the static pose for a part without sensors.
     """
 
     joint: str

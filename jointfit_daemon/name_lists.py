@@ -1,6 +1,6 @@
 """Lists of names and words in messages.
 
-Invariant: a list contains every name, or the number of those that it omits.
+Invariant: a list contains every name, or the number of omitted names.
 """
 
 from __future__ import annotations

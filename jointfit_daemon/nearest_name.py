@@ -63,8 +63,8 @@ _OTHER_WORDS = {
     "vertical": ("up_axis",),
     "zaxis": ("up_axis",),
 }
-"""Keys of rig.toml for each synonym. Synonyms are in lower case without separators. The suggestion
-is the first key of the synonym that the table permits."""
+"""Keys of rig.toml for each synonym. Synonyms are in lower case without separators. The first of
+these keys that the table permits is suggested."""
 
 
 def nearest_key(key: object, known: Iterable[str]) -> str | None:

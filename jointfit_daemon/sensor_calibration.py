@@ -124,7 +124,7 @@ def calibration_of(settings: object) -> SensorCalibrationSettings | None:
 
 
 def exchanged_sensor(settings: object, serial: object) -> str | None:
-    """Return a warning if the calibration belongs to a sensor with another serial number."""
+    """Return a warning if the calibration belongs to another serial number; None otherwise."""
     calibration = calibration_of(settings)
     if calibration is None or calibration.serial in {None, str(serial)}:
         return None

@@ -31,7 +31,10 @@ def from_z_up(vectors: ArrayLike, up_axis: Axis = "y") -> Array:
 
 
 def quaternions_to_z_up(quaternions: ArrayLike, up_axis: Axis = "y") -> Array:
-    """Return normalized quaternions (w, x, y, z) of a file in the project's axes; 0 becomes NaN."""
+    """Return normalized quaternions (w, x, y, z) of a file in the axes of the project.
+
+    A quaternion of zeros becomes NaN.
+    """
     columns = [0, *(1 + i for i in _TO_Z_UP[up_axis])]
     turned = np.asarray(quaternions, dtype=np.float64)[..., columns]
     norms = np.linalg.norm(turned, axis=-1, keepdims=True)

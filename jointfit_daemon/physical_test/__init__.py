@@ -1,7 +1,7 @@
 """Physical test of a sensor: three rotations by hand show whether its frames are as configured.
 
-Invariant: the result of a test depends only on the received chunks. Live and recorded tests of the
-same chunks have the same result.
+Invariant: the result of a test depends only on the received chunks. A live test and a recorded test
+with the same chunks have the same result.
 """
 
 from jointfit_daemon.physical_test._frame_evaluation import explain_frames, fit_frames

@@ -6,11 +6,11 @@ A sensor at rest with its z axis up is rotated three times by 90 degrees:
 2. about its own x axis, so that its y axis points up;
 3. about the vertical again, counter-clockwise.
 
-Let ``q_k`` be the orientation after rotation k. ``q_1 q_0*`` and ``q_3 q_2*`` must be +90 degrees
-about z in the world, and ``q_1* q_2`` must be +90 degrees about x in the sensor. Together the
-rotations determine the convention except for the heading. If the device sends the inverse
-quaternion, world and sensor are exchanged. This is detected, because the axes of rotations 1 and 3
-are equal in the world, but perpendicular in the sensor.
+Let ``q_0`` be the orientation before the first rotation, and ``q_k`` the orientation after rotation
+k. ``q_1 q_0*`` and ``q_3 q_2*`` must be +90 degrees about z in the world, and ``q_1* q_2`` must be
++90 degrees about x in the sensor. Together the rotations determine the convention except for the
+heading. A device that sends the inverse quaternion exchanges world and sensor. The test detects
+this, because the axes of rotations 1 and 3 are equal in the world, but perpendicular in the sensor.
 
 If a device exchanges components or signs of q, it applies an orthogonal transformation to q. Such a
 transformation is always equivalent to rotations of world and sensor that are applied to q or to the
@@ -76,7 +76,7 @@ def fit_frames(rests: Array) -> FrameFit:
 
 
 def explain_frames(received: Array) -> str:
-    """Return a text on the convention that explains the received quaternions.
+    """Return a text that names the convention of the received quaternions.
 
     The rotations determine the order of the components, the direction, and the axes of world and
     sensor. Each axis is rounded to the nearest coordinate axis.
@@ -115,9 +115,10 @@ def explain_frames(received: Array) -> str:
 
 
 def _find_axes(q: Array) -> tuple[str, str] | None:
-    """Return the vertical axis of the world and the printed axes, each as the nearest axis.
+    """Return the name of the world axis that points up, and the sensor axis of each printed axis.
 
-    The result is None if the rotations are not about 90 degrees, or their axes do not agree.
+    The result is None if the rotations differ from 90 degrees by more than the tolerance, or if
+    their axes do not agree.
     """
     back = rotation.conjugate(q)
     world = rotation.log(rotation.multiply(q[1:], back[:-1]))

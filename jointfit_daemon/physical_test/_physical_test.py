@@ -80,7 +80,7 @@ class PhysicalTest:
         return STEPS[done].format(id=self.source.id) if done < len(STEPS) else None
 
     def begin(self) -> None:
-        """Start to accept rests, because rests before the first instruction do not count."""
+        """Start to accept rests. Rests before this call do not count."""
         self._finder = RestFinder()
 
     def add(self, chunk: Chunk) -> None:
@@ -99,7 +99,7 @@ class PhysicalTest:
                 self.rests.append(rest)
 
     def result(self) -> PhysicalTestResult:
-        """Evaluate the complete test, which decodes all chunks several times."""
+        """Evaluate the complete test. This decodes all chunks once for each setting to try."""
         return evaluate_recording(self.source, self._chunks, self.rests)
 
 
@@ -137,7 +137,7 @@ def evaluate_recording(
 
 
 def _other_settings(settings: Any) -> list[dict[str, str]]:
-    """Return other values of `_KEYS`, in order of the number of changed keys."""
+    """Return all other choices of the keys `_KEYS`, the choices with the fewest changes first."""
     fields = type(settings).model_fields
     choices = {key: get_args(fields[key].annotation) for key in _KEYS if key in fields}
     all_values = [dict(zip(choices, values, strict=True)) for values in product(*choices.values())]

@@ -36,7 +36,8 @@ class OfflineCalibration:
     rig: Rig
     """The configuration at the end of the session."""
     calibration: Calibration | None
-    """Last new calibration, with the date of its result; None if no phase yielded a calibration."""
+    """Last new calibration, with the date of the session; None if no phase yielded a calibration.
+    """
     rejected: str | None
     """Reason why the last result was rejected; None if it was accepted."""
     quality: Mapping[str, object]

@@ -1,8 +1,8 @@
 """Processing of recorded events in a new core, with optional changes of rig, calibration or fits.
 
 Invariant: without changes, the core receives exactly the recorded events, so its outputs equal the
-outputs of the daemon, byte for byte. With changes, dependent results are computed again. In this
-case the core receives no recorded fit, progress message or stored version.
+outputs of the daemon, byte for byte. With changes, the fits of calibrations are computed again, and
+the core receives none of the recorded events with results of fits.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def process_events(
     changes
         Changes relative to the recorded run; None for no change.
     core
-        A new core; None creates a core without observer.
+        A new core. By default, the function creates one.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def process_events(
 
 
 class _ChangedRun:
-    """A core with replaced configurations, whose fits are computed in this process.
+    """Processes events with the changes in a core, and computes the fits in this process.
 
     With another rig, the result of a fit is delivered at the instant at which the fit was
     requested. With the recorded rig, the result is delivered at the instant of the recorded result,
@@ -177,7 +177,7 @@ class _ChangedRun:
                 if self._changes.rig is not None:
                     yield from self._finish_job(output, self._now_ns)
                 else:
-                    self._waiting = output  # the only worker drops the previous job
+                    self._waiting = output  # the daemon has one worker: it drops the previous job
 
     def _finish_job(self, job: FitJob, t_ns: int) -> Iterator[tuple[Event, list[Output]]]:
         self._waiting = None
@@ -185,7 +185,10 @@ class _ChangedRun:
 
 
 def compute_fit(job: FitJob) -> FitResult:
-    """Run a fit in this process. The result passes through JSON, as the result of a worker does."""
+    """Compute a fit in this process and return its result.
+
+    The result passes through JSON, as the result of a worker does.
+    """
     from jointfit_daemon.calibration.phases import run_job  # noqa: PLC0415 - loads scipy
 
     text = orjson.dumps(run_job(job.work).to_dict(), option=orjson.OPT_SERIALIZE_NUMPY)

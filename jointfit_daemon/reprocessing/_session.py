@@ -40,9 +40,9 @@ def load_session(
     path
         Path of the recording. For a session in several parts, the path of any part.
     rig
-        Rig that replaces the recorded rig. If it is given, fits are computed again.
+        Rig that replaces the recorded rig. With another rig, calibrations are fitted again.
     calibration
-        Calibration that replaces the recorded calibrations, from the beginning.
+        Calibration to use from the first to the last event, instead of the recorded calibrations.
 
     Raises
     ------

@@ -1,9 +1,8 @@
 """Collection of the measurements and outputs of a core as arrays of a session.
 
-All series share the time axis of the cameras. For this purpose, the lag of each sensor is
-subtracted from its timestamps. The lags come from the calibration in use at the end of the session.
-Rows that are not later than the previous row are omitted, because a clock that settles or restarts
-may step back.
+All series use the clock of the cameras. For this purpose, the lag of each sensor is subtracted from
+its timestamps. The lags come from the calibration in use at the end of the session. Rows that are
+not later than the previous row are omitted, because a clock that settles or restarts may step back.
 """
 
 from __future__ import annotations
@@ -257,7 +256,7 @@ class SessionCollector:
         )
 
     def _position_events(self, begin_ns: int) -> list[tuple[int, TimelineEvent]]:
-        """Return an event with the number of unknown positions if the other ones are known."""
+        """Return one event if the cameras measured the limb's position in only some frames."""
         frames, measured = len(self._measured_origins), sum(self._measured_origins)
         if measured in {0, frames}:
             return []
@@ -287,7 +286,8 @@ def _joint_series(
     position_sd = None
     if sds:
         angle_sd, position_sd = rows.known_columns(6, 1), rows.known_columns(7, 1)
-        # Positions from the fixed origin and from the cameras differ by an unknown vector.
+        # Positions from the fixed origin and from the cameras differ by an unknown vector. If the
+        # session contains positions of both kinds, only those from the cameras are kept.
         measured = rows.columns(8, 1).ravel() > 0.0
         if position is not None and measured.any():
             position[~measured] = nan
@@ -305,7 +305,7 @@ def _joint_series(
 
 
 def _marker_series(frames: Sequence[tuple[int, MocapFrame]], begin_ns: int) -> MarkerSeries | None:
-    """Return the frames with all labels that occurred; labels missing in a frame are NaN."""
+    """Return the markers of all frames; a marker that a frame does not contain is NaN there."""
     layouts = dict.fromkeys(frame.layout for _, frame in frames)
     labels = tuple(dict.fromkeys(label for layout in layouts for label in layout.markers))
     if not labels:

@@ -1,8 +1,8 @@
 """Comparison of a replay with the recorded outputs, byte for byte.
 
-If a recording did not begin with the start of the daemon, it contains the configuration, but not
-the state of clocks and filters. In this case, orientations are compared with a tolerance after a
-warm-up, and the result states this.
+If a recording began after the start of the daemon, it contains the configuration, but not the state
+of clocks and filters. In this case, orientations are compared with a tolerance after a warm-up, and
+the result states this.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ WARM_UP_S = 20.0
 """Warm-up of a replay whose recording began after the start of the daemon, s. After this time the
 clocks and filters of the replay agree with the clocks and filters of the daemon."""
 TOLERANCE_RAD = np.radians(1.0)
-"""Largest difference of an orientation after the warm-up, rad."""
+"""Largest tolerated angle between recorded and replayed orientations after the warm-up, rad."""
 TOLERATED_SHARE = 0.99
 """Smallest fraction of the orientations that must be within the tolerance. Orientations near a lost
 frame may differ by more."""
@@ -147,8 +147,8 @@ class Verification:
 
 def _tolerant_lines(found: TolerantComparison) -> list[str]:
     begin = (
-        "the recording did not begin with the daemon, so its outputs are compared with a tolerance "
-        f"of {np.degrees(TOLERANCE_RAD):g}° after a warm-up of {WARM_UP_S:g} s"
+        "the recording began after the start of the daemon, so its outputs are compared with a "
+        f"tolerance of {np.degrees(TOLERANCE_RAD):g}° after a warm-up of {WARM_UP_S:g} s"
     )
     if found.compared == 0:
         return [begin, "no orientation could be compared: the recording is too short"]
@@ -184,7 +184,7 @@ def verify_recording(path: Path) -> Verification:
 
 @dataclass(slots=True)
 class _ByteComparison:
-    """Outputs of the replay that are not yet compared, in order."""
+    """Replay of events, and comparison of its outputs with the recorded outputs, in order."""
 
     begin_ns: int | None = None
     now_ns: int = 0
@@ -192,7 +192,7 @@ class _ByteComparison:
     compared: dict[str, int] = field(default_factory=dict)
 
     def feed(self, core: Core, event: Event) -> Difference | None:
-        """Process an event; return a difference if outputs of earlier events are left over."""
+        """Process an event; return a difference if an earlier output was not in the recording."""
         if self.expected:
             channel, data = self.expected[0]
             return Difference(self.seconds, channel, "", "none", data.decode("utf-8", "replace"))
@@ -204,7 +204,7 @@ class _ByteComparison:
         return None
 
     def compare(self, message: RecordedMessage) -> Difference | None:
-        """Compare a recorded output with the next output of the replay."""
+        """Return how a recorded output differs from the next replayed output; None if equal."""
         if not self.expected:
             recorded = message.data.decode("utf-8", "replace")
             return Difference(self.seconds, message.channel, "", recorded, "none")
@@ -276,7 +276,7 @@ def _first_difference(recorded: Any, replayed: Any, key: str) -> tuple[str, str,
     return key, orjson.dumps(recorded).decode(), orjson.dumps(replayed).decode()
 
 
-# --- recordings that began later -----------------------------------------------------------------
+# --- recordings that began after the start of the daemon -----------------------------------------
 
 
 class _Orientations:
@@ -293,7 +293,7 @@ class _Orientations:
             rows.append(q)
 
     def add_replayed(self, outputs: Iterable[Output]) -> None:
-        """Append the limb states that are among the outputs of the replay."""
+        """Append the orientations of all limb states among the outputs of the replay."""
         for output in outputs:
             if isinstance(output, LimbState):
                 for segment in output.segments:

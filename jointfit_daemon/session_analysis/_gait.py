@@ -118,8 +118,8 @@ def find_gait_cycles(shank: SegmentSeries) -> GaitCycles:
         return GaitCycles(shank.name, found, None)
     if fastest < SWING_RATE:
         reason = (
-            f"the {shank.name} rotates forward with at most {np.degrees(fastest):.0f}°/s, in"
-            f" walking with more than {np.degrees(SWING_RATE):.0f}°/s"
+            f"the {shank.name} rotates forward with at most {np.degrees(fastest):.0f}°/s; walking"
+            f" needs more than {np.degrees(SWING_RATE):.0f}°/s"
         )
     elif reasons and len(reasons) >= len(candidates):
         reason = max(set(reasons), key=reasons.count)
@@ -176,8 +176,8 @@ def _objection(times: Array, rates: Array, cycle: tuple[float, float]) -> str | 
     share = float((inside > 0.0).mean())
     if not SWING_SHARE[0] <= share <= SWING_SHARE[1]:
         return (
-            f"the shank rotates forward during {100 * share:.0f} % of a movement, in walking during"
-            f" {100 * SWING_SHARE[0]:.0f} to {100 * SWING_SHARE[1]:.0f} %"
+            f"the shank rotates forward during {100 * share:.0f} % of a movement; in walking, the"
+            f" share is {100 * SWING_SHARE[0]:.0f} to {100 * SWING_SHARE[1]:.0f} %"
         )
     if np.ptp(np.cumsum(inside)) * (times[1] - times[0]) < LEAST_RANGE:
         return (

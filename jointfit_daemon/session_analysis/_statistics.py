@@ -21,7 +21,8 @@ _LEAST_GAP_S = 0.05
 """Shortest interval without samples that counts as a gap, s. A delay of some samples is not a gap.
 """
 _LEAST_GAP_PERIODS = 3.0
-"""Shortest interval without samples that counts as a gap, in sample periods."""
+"""Shortest interval without samples that counts as a gap, in sample periods. The longer of the two
+limits applies."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,8 +93,8 @@ class AngleDifference:
     worst: float
     """Largest absolute difference, rad."""
     coverage: float
-    """Fraction of `difference` within the 95 % interval from the standard deviation of the sensor
-    angle; NaN if this standard deviation is unknown.
+    """Fraction of `difference` within the 95 % interval that the standard deviation of the sensor
+    angle predicts; NaN if this standard deviation is unknown.
     """
 
     @property
@@ -105,7 +106,7 @@ class AngleDifference:
 def angle_difference(
     sensors: JointSeries, cameras: JointSeries, angle: str
 ) -> AngleDifference | None:
-    """Compare an angle at the instants of camera frames; None without common instants."""
+    """Compare an angle at the instants of camera frames; return None without common instants."""
     own = interpolate_values(sensors.t_s, sensors.angles[angle], cameras.t_s)
     reference = cameras.angles[angle]
     difference = np.mod(own - reference + np.pi, 2.0 * np.pi) - np.pi

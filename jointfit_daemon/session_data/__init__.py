@@ -1,8 +1,8 @@
-"""Recorded session as arrays, independent of file formats, for files, replay and reports.
+"""Recorded session as arrays, independent of any file format.
 
-Every series has its own times in seconds since the start of the session. CONVENTIONS.md defines
-world and segment axes. The optical world and the world of the sensors differ by a rotation about
-the vertical.
+Every series has its own times in seconds since the start of the session. CONVENTIONS.md defines the
+axes of the world and of the segments. The optical world and the world of the sensors differ by a
+rotation about the vertical.
 """
 
 from jointfit_daemon.session_data._resampling import (

@@ -25,8 +25,8 @@ sample is bridged."""
 UNIFORM_SHARE = 0.01
 """Largest deviation of an instant from a uniform time axis, in sample periods."""
 _EXACT_SHARE = 1e-6
-"""Largest distance to a row, in sample periods, at which an instant has the value of this row
-without interpolation.
+"""Largest distance between an instant and a row, in sample periods, at which the value of the row
+is returned without interpolation.
 """
 
 
@@ -74,7 +74,7 @@ def uniform_times(axes: Sequence[Array]) -> Array:
 
 
 def _period(t_s: Array) -> float:
-    """Return the period of a series with missing rows, s; infinity for fewer than two rows."""
+    """Return the mean sample period, s, without gaps; infinity for fewer than two rows."""
     if len(t_s) < 2:  # noqa: PLR2004 - an interval has two ends
         return float("inf")
     steps = np.diff(t_s)
@@ -83,7 +83,7 @@ def _period(t_s: Array) -> float:
 
 
 def rows_on_axis(t_s: Array, axis_s: Array) -> NDArray[np.intp] | None:
-    """Return the row of a uniform axis for every instant; None if any instant is between rows.
+    """Return the row of a uniform axis for every instant, or None if an instant has no own row.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def rows_on_axis(t_s: Array, axis_s: Array) -> NDArray[np.intp] | None:
 
 
 def interpolate_values(t_s: Array, values: Array, at_s: Array) -> Array:
-    """Interpolate linearly from shape (n, ...) to (m, ...).
+    """Return `values`, shape (n, ...), interpolated linearly at `at_s`, as shape (m, ...).
 
     The result is NaN at instants outside the series or in a gap.
     """
@@ -120,10 +120,11 @@ def interpolate_values(t_s: Array, values: Array, at_s: Array) -> Array:
 
 
 def interpolate_orientations(t_s: Array, q: Array, at_s: Array) -> Array:
-    """Interpolate rotations from shape (n, 4) to (m, 4), with NaN as in `interpolate_values`.
+    """Return orientations `q`, shape (n, 4), interpolated at `at_s`, as shape (m, 4).
 
-    The result is the spherical linear interpolation q_i exp(a log(q_i* q_i+1)) along the shortest
-    rotation. a is the position between rows i and i + 1, from 0 to 1.
+    The interpolation is spherical linear, q_i exp(a log(q_i* q_k)), along the shortest rotation
+    from row i to the next row k. a is the position between these rows, from 0 to 1. The result is
+    NaN at instants outside the series or in a gap.
     """
     i, j, share = _neighbours(t_s, at_s)
     if not len(t_s):
@@ -134,7 +135,10 @@ def interpolate_orientations(t_s: Array, q: Array, at_s: Array) -> Array:
 
 
 def _neighbours(t_s: Array, at_s: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
-    """Return the rows before and after each instant, and the position in between; NaN in gaps."""
+    """Return the rows before and after each instant, and its position between them, 0 to 1.
+
+    The position is NaN outside the series and in gaps.
+    """
     if not len(t_s):
         none = np.zeros(len(at_s), dtype=np.intp)
         return none, none, np.full(len(at_s), np.nan)

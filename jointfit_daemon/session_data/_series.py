@@ -97,7 +97,8 @@ class JointSeries:
     angles: Mapping[str, Array] = field(default_factory=dict)
     """Angles by name (``flexion``, ``adduction`` ...), rad, shape (n,); NaN where unknown."""
     angle_sd: Mapping[str, Array] = field(default_factory=dict)
-    """Standard deviations of some of the angles, rad, shape (n,)."""
+    """Standard deviations by name of the angle, rad, shape (n,). Names without an estimate are left
+    out."""
     position: Array | None = None
     """Joint center in the world, m, shape (n, 3)."""
     position_sd: Array | None = None

@@ -24,13 +24,13 @@ class CorruptBytes(NamedTuple):
 
 
 class CorruptRun:
-    """Combines consecutive bytes without a message to runs.
+    """Combines consecutive bytes without a message into runs.
 
     Parameters
     ----------
     longest : int
-        Number of bytes after which a run is reported, so that the count of corrupt bytes is
-        current.
+        Number of bytes after which a run is reported, so that the count of corrupt bytes is up to
+        date.
     no_start : str
         Reason that is reported for bytes outside of all possible messages.
     """

@@ -23,14 +23,14 @@ _S = sqrt(0.5)
 _CHECKED = 100
 """Number of samples after which the share of rejected samples is checked."""
 _MOST_REJECTED = 90
-"""Number of rejected samples, out of `_CHECKED`, that only a wrong byte order or scale can
-explain."""
+"""Number of rejected samples out of `_CHECKED`. Only a wrong byte order or scale can explain
+more."""
 
 
 def canonical(
     native: Quaternion, world: World = "ENU", *, world_to_sensor: bool = False
 ) -> Quaternion:
-    """Convert `native` (w, x, y, z, any norm) to an orientation from sensor to ENU, same norm.
+    """Return `native` as an orientation from sensor to ENU, with the same norm.
 
     Parameters
     ----------
@@ -92,7 +92,10 @@ class OrientationGate:
         self._norms: list[float] = []
 
     def admit(self, q: Quaternion) -> Quaternion | None:
-        """Return `q` as a unit quaternion with the sign of the last result; None if rejected."""
+        """Return `q` as a unit quaternion, with the sign nearest to the last result.
+
+        The result is None if `q` is rejected.
+        """
         w, x, y, z = q
         square = w * w + x * x + y * y + z * z
         refused = not self._low <= square <= self._high  # NaN compares false: refused
@@ -128,5 +131,5 @@ class OrientationGate:
         return median(self._norms) if self._norms else float("nan")
 
     def forget(self) -> None:
-        """Restart the continuity of signs, because the device restarted."""
+        """Forget the sign of the last result, because the device restarted."""
         self._last = (1.0, 0.0, 0.0, 0.0)

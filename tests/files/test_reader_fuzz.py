@@ -244,8 +244,8 @@ def messages() -> Iterator[tuple[str, Callable[[bytes], bytes], str]]:
     yield "trc", lambda data: data.replace(b".", b","), "decimal comma"
     yield "sto", lambda data: data.replace(b".", b","), "decimal comma"
     yield "orientations", lambda data: data.replace(b"1", b"0,9"), "decimal commas"
-    yield "trc", lambda data: b"\n".join(data.split(b"\n")[:6]) + b"\n", "header without rows"
-    yield "sto", lambda data: b"\n".join(data.split(b"\n")[:7]) + b"\n", "header without rows"
+    yield "trc", lambda data: b"\n".join(data.split(b"\n")[:6]) + b"\n", "contains no rows"
+    yield "sto", lambda data: b"\n".join(data.split(b"\n")[:7]) + b"\n", "contains no rows"
     yield (
         "trc",
         lambda data: data.replace(b"\t50\t", b"\t0\t", 1).replace(b"50", b"0", 1),

@@ -152,7 +152,7 @@ def test_recording_that_began_later_is_compared_with_a_tolerance(
     assert found.tolerant is not None
     assert found.tolerant.compared > 200
     assert found.passed is agrees
-    assert "did not begin with the daemon" in found.lines()[0]
+    assert "began after the start of the daemon" in found.lines()[0]
 
 
 def test_recording_without_outputs_does_not_pass(tmp_path: Path) -> None:

@@ -1,13 +1,13 @@
-"""Conversion of ``candump`` text to CAN chunks; every line is counted.
+"""Conversion of ``candump`` text to CAN chunks.
 
     (1436509052.249713) can0 105#2A366C2B       eight identifier digits: 29 bits; #R: remote
     (1436509052.249713)  can0  105   [4]  2A 36 6C 2B       without -L; the time may be missing
 
-A chunk is one record of `jointfit_protocols.can_frame` with 24 bytes: i64 time in ns, u32
+A chunk is one record of `jointfit_protocols.can` with 24 bytes: i64 time in ns, u32
 identifier, u8 flags, u8 size, two zeros, eight data bytes. This module packs the record itself,
 because the daemon does not import wire formats. A test compares both implementations. A line that
-is not a classic CAN frame becomes a record of lost bytes of the same format, so that the decoder
-counts it.
+is not a classic CAN frame becomes a record that states the number of its bytes, so that the decoder
+counts them as lost.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _PLAIN_LINE = re.compile(
 
 
 def is_candump(data: bytes) -> bool:
-    """Return whether the first line, blanks and comments excepted, is ``candump`` output."""
+    """Return whether the first line that is neither empty nor a comment is ``candump`` output."""
     for line in data[:4096].splitlines():
         text = line.strip()
         if text and not text.startswith(b"#"):
@@ -86,7 +86,8 @@ def pack_can_frame(
 def frame_sizes(records: bytes) -> dict[tuple[int, bool], int]:
     """Return the number of data bytes in the last frame of each identifier in `records`.
 
-    A key consists of an identifier and whether it has 29 bits. Error and remote frames are ignored.
+    A key consists of an identifier and a flag, which is true if the identifier has 29 bits. Error
+    and remote frames are ignored.
     """
     whole = len(records) // RECORD_BYTES * RECORD_BYTES
     return {

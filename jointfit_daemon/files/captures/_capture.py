@@ -8,11 +8,11 @@ The file type is determined from the first bytes, not from the name:
 | pcapng, pcap | datagram, split | the same, and the packets in one direction of a TCP connection |
 | pcapng, pcap | stream | the segments of one direction of a TCP connection |
 | pcapng, pcap | can | one per classic CAN frame of a SocketCAN link |
-| ``candump`` text | can | one per line, a record of `jointfit_protocols.can_frame` |
+| ``candump`` text | can | one per line, a record of `jointfit_protocols.can` |
 | raw bytes | stream | 4096 bytes each; the times are computed for 921 600 baud |
 | raw bytes | datagram, split | packets |
-| raw bytes | datagram | messages ``u16 id, u16 length, …`` that fit exactly, else one datagram |
-| raw bytes | can | consecutive records of `jointfit_protocols.can_frame` |
+| raw bytes | datagram | messages ``u16 id, u16 length, …`` that fill the file, else one datagram |
+| raw bytes | can | consecutive records of `jointfit_protocols.can` |
 
 *Split* marks a driver with a `packet_stream`, whose chunks are packets of a TCP connection.
 """
@@ -99,8 +99,9 @@ def read_capture(
     split : callable, optional
         Function that returns a new splitter, which divides the bytes of a connection into chunks.
     rate : callable, optional
-        Function that rates the directions of TCP connections. If it is None, TCP connections are
-        ignored.
+        Function that returns the number of messages in the chunks of one direction of a TCP
+        connection. The direction with the most messages is used. Without this function, TCP
+        connections are ignored.
 
     Raises
     ------
@@ -179,8 +180,8 @@ def _pieces_as_chunks(pieces: Iterable[Piece], split: Callable[[], Splitter] | N
 def _require_wire(path: Path, found: str, recorded: Wire, expected: Wire) -> None:
     if recorded != expected:
         raise UnreadableCaptureError(
-            f"{path}: {found}, where a {expected} is expected: name the driver of the device that"
-            " was recorded",
+            f"{path}: {found}, but the driver reads {expected} data: name the driver of the device"
+            " that was recorded",
             recorded,
         )
 

@@ -55,7 +55,8 @@ _TCP_HEAD = struct.Struct(">HHIIBB6x")
 _SYN = 0x02
 _CAN_LINK = 227
 _CAN_COOKED = {113: 16, 276: 20}
-"""Number of bytes before the CAN frame of cooked links, which mark CAN by the protocol 0x000C."""
+"""Number of bytes before a CAN frame, by type of cooked link. A cooked link marks CAN frames by the
+protocol 0x000C."""
 _CAN_PROTOCOL = b"\x00\x0c"
 _CAN_HEAD = struct.Struct(">IB3x")
 _CAN_EXTENDED, _CAN_REMOTE, _CAN_ERROR = 1 << 31, 1 << 30, 1 << 29
@@ -165,7 +166,7 @@ def _read_frames(data: bytes) -> Iterator[tuple[int, int, bytes]]:
 class _Interface(NamedTuple):
     link: int
     most: int
-    """Largest number of captured bytes of a packet; 0: all."""
+    """Largest number of captured bytes of a packet; 0 without a limit."""
     ticks_per_s: int
     offset_s: int
 

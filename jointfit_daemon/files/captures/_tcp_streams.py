@@ -1,9 +1,9 @@
 """Conversion of TCP segments to a byte stream for each direction of a connection, and to packets.
 
 Each retransmitted segment is used once, and late segments are sorted into the stream. A capture may
-begin in the middle of a connection or lack segments. The bytes after such a hole do not continue
-the bytes before it. Most servers begin a packet with a new segment, so the search for packets
-restarts at the next segment.
+begin in the middle of a connection, or have holes, where segments are missing. The bytes after a
+hole do not continue the bytes before it. Most servers begin a packet with a new segment, so the
+search for packets restarts at the first segment after the hole.
 
 Invariant: all functions are pure; at most `_MOST_WAITING` segments of a direction wait for an
 earlier one.
@@ -56,7 +56,7 @@ class Piece(NamedTuple):
 
 
 def directions(segments: Iterable[TcpSegment]) -> list[list[Piece]]:
-    """Return the pieces of each direction of each connection that carries bytes."""
+    """Return the pieces of each direction that carries bytes, for all connections."""
     found: dict[object, _Direction] = {}
     for segment in segments:
         found.setdefault((segment.source, segment.target), _Direction()).add(segment)
@@ -68,7 +68,7 @@ def directions(segments: Iterable[TcpSegment]) -> list[list[Piece]]:
 def split_pieces(pieces: Iterable[Piece], split: Callable[[], Splitter]) -> Iterator[Chunk]:
     """Yield one chunk for each packet.
 
-    Bytes without a packet become a chunk of the same length filled with zeros.
+    Bytes that belong to no packet become a chunk of the same length that contains zeros.
     """
     stream, t_ns = split(), 0
     for piece in pieces:

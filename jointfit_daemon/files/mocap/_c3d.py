@@ -33,7 +33,7 @@ class C3dTrial:
 
     trajectories: MarkerTrajectories
     up_axis: str | None
-    """Vertical screen axis "x", "y" or "z", if declared."""
+    """Vertical screen axis "x", "y" or "z"; None if the file declares none."""
     events: tuple[C3dEvent, ...] = ()
     """Events in the order of the file."""
     own_texts: Mapping[str, str] = field(default_factory=dict)
@@ -44,14 +44,14 @@ def read_c3d(path: Path) -> C3dTrial:
     """Return points and events of a C3D file.
 
     Labels are returned as written (``Subject:LASI``). Frame numbers and `t_s` start at the first
-    frame of the trial, whose number is rarely 1. Analog channels are ignored.
+    frame of the trial, whose number is often larger than 1. Analog channels are ignored.
 
     Raises
     ------
     MissingPackageError
         The package ``c3d`` is not installed.
     MalformedFileError
-        Not a C3D file, damaged, without points, or with an unknown unit of length.
+        The file is not C3D, is damaged, contains no points, or has an unknown unit of length.
     """
     try:
         import c3d  # noqa: PLC0415 - optional, and slow to import
@@ -85,13 +85,13 @@ def _read(path: Path, reader: Any) -> C3dTrial:
         )
     frames = [points[: len(names), :4].copy() for _, points, _ in reader.read_frames(copy=False)]
     if not frames:
-        raise MalformedFileError(f"{path}: a header without frames: export the trial again")
+        raise MalformedFileError(f"{path}: contains no frames: export the trial again")
 
     cells = np.array(frames, dtype=np.float64).reshape(-1, len(names), 4)
     first, rate_hz = int(reader.first_frame), float(reader.point_rate)
     if not 0.0 < rate_hz < math.inf:
         raise MalformedFileError(
-            f"{path}: POINT:RATE is {rate_hz:g}, expected frames a second (Hz): export it again"
+            f"{path}: POINT:RATE is {rate_hz:g}, expected a frame rate in Hz: export it again"
         )
 
     declared = int(reader.last_frame) - first + 1

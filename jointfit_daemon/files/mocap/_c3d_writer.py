@@ -24,7 +24,7 @@ _BLOCK = 512
 _KEY = 0x50
 """Second byte of header and parameters in every C3D file."""
 _INTEL = 84
-"""Number of the processor type Intel: little-endian."""
+"""Code of the processor type Intel, whose numbers are little-endian."""
 _FLOATS = -1.0
 """Value of POINT:SCALE. A negative value means that the points are floats in POINT:UNITS."""
 _CHARACTERS, _INTEGER, _REAL = -1, 2, 4
@@ -93,8 +93,8 @@ def c3d_bytes(
     frames, points = positions.shape[:2]
     last_frame = first_frame + frames - 1
 
-    # The parameters contain the number of the first data block. Their length does not depend on
-    # this number.
+    # The parameters contain the number of the first data block, which follows from their length.
+    # The length is computed first, because it does not depend on this number.
     entries = _entries(names, frames, first_frame, rate_hz, up)
     entries += _event_entries(events)
     if own_texts:
@@ -127,8 +127,8 @@ def c3d_bytes(
     if last_frame <= _MOST_WORD:
         sections.append(data)
         data = b""
-    # Programs that use only the header read a longer file to its end. The file therefore has no
-    # padding frames.
+    # Programs that use only the header read a trial with frame numbers above `_MOST_WORD` up to the
+    # end of the file. The file of such a trial therefore has no padding.
     return b"".join(section + bytes(-len(section) % _BLOCK) for section in sections) + data
 
 
@@ -194,6 +194,6 @@ def _parameter(group: int, name: str, kind: int, shape: tuple[int, ...], data: b
 
 
 def _entry(name: str, group: int, rest: bytes) -> bytes:
-    """Return a parameter entry: lengths, name, relative offset of the next entry, and `rest`."""
+    """Return an entry: length of the name, group, name, offset of the next entry, and `rest`."""
     offset = struct.pack("<H", len(rest) + 2)
     return struct.pack("<bb", len(name), group) + name.encode() + offset + rest

@@ -38,6 +38,7 @@ class MarkerTrial:
     up_axis: Axis
     """Vertical axis of the file, which became z."""
     up_said_by: Literal["file", "caller", "convention of the format"]
+    """Source of `up_axis`."""
 
     def points(self, names: Sequence[str]) -> NDArray[np.float64]:
         """Return the trajectories of markers by name, m, shape (n, len(names), 3).
@@ -110,7 +111,7 @@ def read_marker_trial(path: Path, up_axis: Axis | None = None) -> MarkerTrial:
     Raises
     ------
     MalformedFileError
-        Neither TRC nor C3D, or damaged.
+        The file is neither TRC nor C3D, or is damaged.
     MissingPackageError
         The optional C3D reader is not installed.
     """

@@ -78,7 +78,8 @@ def read_trc(path: Path) -> MarkerTrajectories:
     Raises
     ------
     MalformedFileError
-        Not a TRC file, no markers, two markers of one name, no rows, or an unknown unit of length.
+        The file is not TRC, has no markers, two markers of one name, no rows, or an unknown unit of
+        length.
     """
     lines = read_lines(path)
     _require_header(path, lines)
@@ -89,7 +90,7 @@ def read_trc(path: Path) -> MarkerTrajectories:
             f"{path}, line 4: no marker names after Frame# and Time: export it again"
         )
 
-    # OpenSim also rejects equal names.
+    # OpenSim also rejects two markers of one name.
     for name, times in Counter(filter(None, names)).items():
         if times > 1:
             columns = [str(3 + 3 * at) for at, other in enumerate(names) if other == name]
@@ -105,7 +106,7 @@ def read_trc(path: Path) -> MarkerTrajectories:
     if not 0.0 < rate_hz < math.inf:
         found = header.get("DataRate", "missing")
         raise MalformedFileError(
-            f"{path}, line 3: DataRate is {found}, expected frames a second (Hz)"
+            f"{path}, line 3: DataRate is {found}, expected a frame rate in Hz"
         )
 
     body = enumerate(lines[_HEADER_ROWS:], start=_HEADER_ROWS + 1)

@@ -33,7 +33,7 @@ def load_model(path: Path) -> LoadedModel:
     Raises
     ------
     MalformedFileError
-        Damaged file, or a model that is not supported.
+        The file is damaged, or its model is not supported.
     """
     if path.suffix.lower() == ".osim":
         imported = read_osim(path)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def read_marker_weights(path: Path) -> dict[str, float]:
-    """Return the weights by marker name; squared marker errors are multiplied by them.
+    """Return the weights by marker name; each one multiplies the squared error of its marker.
 
     Parameters
     ----------
@@ -23,7 +23,7 @@ def read_marker_weights(path: Path) -> dict[str, float]:
     Raises
     ------
     MalformedFileError
-        Damaged file, or a weight that is not a number of at least 0.
+        The file is damaged, or a weight is not a number of at least 0.
     """
     if path.suffix.lower() == ".xml":
         return read_ik_setup(path).weights

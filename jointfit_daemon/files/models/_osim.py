@@ -67,8 +67,8 @@ def read_osim(path: Path, *, markers: Collection[str] | None = None) -> Imported
     Raises
     ------
     MalformedFileError
-        Not an OpenSim 4 model, unsupported joints or functions, unknown names, or lengths that
-        are not metres.
+        The file is no OpenSim 4 model, contains unsupported joints or functions, unknown names, or
+        lengths that are not metres.
     """
     document = read_document(path)
     names = {m.name for m in document.markers}
@@ -82,8 +82,8 @@ def read_osim(path: Path, *, markers: Collection[str] | None = None) -> Imported
         frames.append((f"joint {joint.name!r}", "child", joint.child.body))
     bodies = ", ".join([GROUND, *document.bodies])
     unknown += [
-        f"{owner}: {end} frame {body!r} is neither a body nor a frame of its own, expected one of "
-        f"{bodies}: correct socket_{end}_frame"
+        f"{owner}: {end} frame {body!r} is neither a body nor a frame defined in this element, "
+        f"expected one of {bodies}: correct socket_{end}_frame"
         for owner, end, body in frames
         if body not in known
     ]
@@ -178,7 +178,7 @@ class _Tree:
         )
 
     def place_marker(self, marker: OsimMarker) -> Marker | None:
-        """Return a marker on its segment; for a marker fixed to the world, None with a remark."""
+        """Return a marker on its segment; None, with a remark, if it is fixed to the world."""
         segment, transform = self._at[marker.body]
         if segment is None:
             self.remarks.append(f"marker {marker.name} is fixed to the world and left out")
@@ -222,7 +222,7 @@ class _Tree:
         return found
 
     def coordinates(self, segment: Segment) -> JointCoordinates:
-        """Return the coordinates of a kept segment; six free ones for a root without parent."""
+        """Return the coordinates of a kept segment; six free ones if its parent is omitted."""
         was_cut = segment.parent is None and (
             segment.name not in self._joints
             or self._at[self._joints[segment.name][0].parent.body][0] is not None

@@ -1,6 +1,7 @@
 """Coordinates of OpenSim joints as functions of the pose of a chain model.
 
-Values have the names, signs and axes of OpenSim, because the functions of the file are evaluated.
+The coordinates have the names, signs and axes of OpenSim, because the functions in the OpenSim file
+compute them.
 """
 
 from __future__ import annotations
@@ -62,7 +63,10 @@ def unnamed_coordinates(segment: str) -> JointCoordinates:
 def _pose(
     joint: OsimJoint, motion: JointMotion, placed: Array, names: tuple[str, ...], values: Array
 ) -> tuple[Array, Array]:
-    """Return rotation, shape (n, 3, 3), and origin, m, shape (n, 3), in axes of the chain."""
+    """Return rotation, shape (n, 3, 3), and origin, m, shape (n, 3), of the child body.
+
+    Both have the axes of the chain. `values` has shape (n, len(names)).
+    """
     given = {name: values[:, k] for k, name in enumerate(names)}
     turns, shifts = sampled_joint(joint, motion, given)
     turned = to_z_up(to_z_up(placed[:3, :3] @ turns).swapaxes(-1, -2)).swapaxes(-1, -2)

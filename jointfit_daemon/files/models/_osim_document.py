@@ -1,7 +1,7 @@
 """Content of an OpenSim file as plain data in its own axes: bodies, joints, frames, markers.
 
 Only names, numbers and frames are interpreted. A document type declaration is rejected before any
-expansion. Entities can therefore neither grow nor refer to other files.
+expansion. XML entities can therefore neither expand nor refer to other files.
 """
 
 from __future__ import annotations
@@ -91,8 +91,8 @@ def read_document(path: Path) -> OsimDocument:
     Raises
     ------
     MalformedFileError
-        Not an OpenSim 4 model, invalid XML, a document type declaration, an oversized file, or
-        a unit of length other than metres.
+        The file is no OpenSim 4 model, contains invalid XML, a document type declaration or a unit
+        of length other than metres, or is larger than `LARGEST`.
     """
     root = read_xml(path)
     model = root.find("Model")
@@ -111,7 +111,7 @@ def read_document(path: Path) -> OsimDocument:
                 "whole model from OpenSim"
             )
         raise MalformedFileError(
-            f"{path}: written by OpenSim before 4.0; open it there once and save it again"
+            f"{path}: written by OpenSim before 4.0: open it in OpenSim 4, and save it again"
         )
 
     unit = text_of(model, "length_units", _METRES)
@@ -140,7 +140,7 @@ def read_document(path: Path) -> OsimDocument:
 
 
 def read_xml(path: Path) -> ET.Element:
-    """Return the root of an XML file without document type; else raise `MalformedFileError`."""
+    """Return the root of an XML file; raise `MalformedFileError` if it has a document type."""
     reject_device(path)
     if path.stat().st_size > LARGEST:
         raise MalformedFileError(
@@ -223,7 +223,7 @@ def body_of(socket: str) -> str:
 
 
 def fixed_xyz(angles: Array) -> Array:
-    """Return the matrix (3, 3) of rotations about x, new y and new z; angles (3,), rad."""
+    """Return the matrix (3, 3) of rotations by `angles`, rad, about x, then new y, then new z."""
     turns = []
     for axis, angle in enumerate(angles):
         j, k = (axis + 1) % 3, (axis + 2) % 3

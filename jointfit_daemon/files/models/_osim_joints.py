@@ -38,7 +38,8 @@ _AT_HOME = 0.05
 """Weight that regularizes a center toward the origin of the joint's own frame. A distance of 1 cm
 costs as much as an error of 0.5 mm."""
 _WIDEST = np.pi / 2
-"""Half of the evaluated range about the default of a coordinate with a wider range, rad."""
+"""Half of the evaluated range about the default value, rad, if a coordinate has no finite range of
+at most 360 degrees."""
 _BEYOND = 0.3
 """Extension of the samples of a coupled joint beyond its range, rad. Some programs do not clamp
 coordinates to their range."""
@@ -68,7 +69,7 @@ def nearest_joint(joint: OsimJoint) -> NearestJoint:
     Raises
     ------
     ValueError
-        Unsupported type of joint or function.
+        The type of the joint, or of one of its functions, is not supported.
     """
     motion = JointMotion(joint)
     moving = [c for c in joint.coordinates if not c.locked]
@@ -109,7 +110,10 @@ def _span(c: Coordinate) -> tuple[float, float]:
 def sampled_joint(
     joint: OsimJoint, motion: JointMotion, values: dict[str, Array]
 ) -> tuple[Array, Array]:
-    """Return R, shape (n, 3, 3), and t, shape (n, 3), from child body to parent body."""
+    """Return R, shape (n, 3, 3), and t, m, shape (n, 3), from child body to parent body.
+
+    `values` contains coordinate values, shape (n,). Other coordinates have their default values.
+    """
     count = max((len(v) for v in values.values()), default=1)
     defaults = {c.name: np.full(count, c.default) for c in joint.coordinates}
     others = {name: np.zeros(count) for name in motion.turning | motion.shifting}
@@ -121,7 +125,7 @@ def sampled_joint(
 
 
 def _centers(joint: OsimJoint, turns: Array, shifts: Array) -> tuple[Array, Array, float]:
-    """Return the center in the parent and in the child, m, and the largest error.
+    """Return the center in the parent and in the child, m, and the largest error, m.
 
     The motion may leave the center undetermined, for example along an axis. In this case the point
     nearest to the joint's own frame is chosen.
@@ -233,7 +237,7 @@ def _axis(turns: Array) -> tuple[Array, Array, Array, float]:
         rest = rotation.average(rotation.multiply(q, rotation.exp(-angles[:, None] * axis)))
         axis, angles = _turned_about(rest, q)
 
-    # The angle increases with the coordinate; otherwise the axis is reversed.
+    # The axis is reversed if the angle decreases while the coordinate increases.
     if angles[-1] < angles[1]:
         axis, angles = -axis, -angles
     rest = rotation.multiply(rest, rotation.exp(angles[0] * axis))
@@ -243,7 +247,10 @@ def _axis(turns: Array) -> tuple[Array, Array, Array, float]:
 
 
 def _turned_about(rest: Array, q: Array, axis: Array | None = None) -> tuple[Array, Array]:
-    """Return the axis and the angles, rad; without `axis`, the principal axis of the rotations."""
+    """Return axis and angles, rad, of the rotations from `rest` to `q`.
+
+    Without `axis`, it is the principal axis of these rotations.
+    """
     v = rotation.log(rotation.multiply(rotation.conjugate(rest), q))
     if axis is None:
         axis = np.asarray(np.linalg.svd(v, full_matrices=False)[2][0])

@@ -56,7 +56,7 @@ class JointMotion:
     Raises
     ------
     ValueError
-        Unsupported type of joint or function.
+        The type of the joint, or of one of its functions, is not supported.
     """
 
     def __init__(self, joint: OsimJoint) -> None:
@@ -110,7 +110,7 @@ class JointMotion:
         Parameters
         ----------
         values
-            Values of each coordinate, shape (n,).
+            Values of each coordinate by its name, shape (n,).
         """
         count = max((len(v) for v in values.values()), default=1)
         q = np.broadcast_to(rotation.IDENTITY, (count, 4))

@@ -22,7 +22,7 @@ class IkSetup:
     time_range: tuple[float, float] | None
     """First and last time of the trial to evaluate, s; None if the file contains no range."""
     ignored: tuple[str, ...]
-    """Names of the applied coordinate tasks, which the program ignores."""
+    """Names of the coordinate tasks that the file applies, but `jointfit` ignores."""
 
 
 def read_ik_setup(path: Path) -> IkSetup:
@@ -31,7 +31,7 @@ def read_ik_setup(path: Path) -> IkSetup:
     Raises
     ------
     MalformedFileError
-        Not XML, no marker task, or a weight that is not a number of at least 0.
+        The file is not XML, has no marker task, or has a weight that is not a number of at least 0.
     """
     root = read_xml(path)
     ignored = [task.get("name", "") for task in root.iter("IKCoordinateTask") if _is_applied(task)]

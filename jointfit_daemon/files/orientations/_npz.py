@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 _GIB = 1 << 30
 LARGEST = _GIB
-"""Largest uncompressed size of all arrays of a file, bytes. It corresponds to 15 hours of four
+"""Largest uncompressed size of all arrays of a file, bytes. It corresponds to 20 hours of four
 sensors at 100 Hz."""
 _KINDS = "biufU"
 """Accepted kinds of NumPy arrays: Booleans, numbers, and text for ``up``."""
@@ -64,7 +64,8 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     Raises
     ------
     MalformedFileError
-        Not an NPZ file, truncated, larger than `LARGEST` when unpacked, or with Python objects.
+        The file is not NPZ, is truncated, contains Python objects, or is larger than `LARGEST` when
+        unpacked.
     """
     reject_device(path)
     with path.open("rb") as file:
@@ -127,7 +128,8 @@ def read_orientations_npz(path: Path) -> OrientationTrial:
     if "t" not in arrays or not (names or bones):
         found = ", ".join(arrays) or "none"
         raise MalformedFileError(
-            f"{path}: arrays t and ID_quat or q_BONE are missing: found {found}; rename or add them"
+            f"{path}: found the arrays {found}, expected t and at least one ID_quat or q_BONE:"
+            " rename or add them"
         )
     up: Axis = "z" if "up" in arrays and str(arrays["up"]) == "z" else "y"
 
@@ -159,14 +161,14 @@ def _numbers(
     if array.shape != shape and not (shape is None and array.ndim == 1):
         wanted = "(n,)" if shape is None else str(shape)
         raise MalformedFileError(
-            f"{path}: {name} has shape {array.shape}, expected {wanted}: one row for each instant"
-            " of t; gaps are NaN"
+            f"{path}: {name} has shape {array.shape}, expected {wanted}: write one row for each"
+            " instant of t, and NaN in gaps"
         )
     return array.astype(np.float64)
 
 
 def write_orientations_npz(path: Path, trial: OrientationTrial) -> None:
-    """Write a trial with z up, compressed."""
+    """Write a trial to a compressed file with z up."""
     arrays: dict[str, ArrayLike] = {"t": trial.t_s, "up": np.array("z")}
     arrays |= {name + _SENSOR: values for name, values in trial.sensors.items()}
     arrays |= {_BONE + bone: values for bone, values in trial.bones.items()}

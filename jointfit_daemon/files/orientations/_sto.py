@@ -1,9 +1,9 @@
 """STO and MOT files of OpenSim: tables over time, and tables of orientations.
 
 Numbers, including angles, are returned as written; ``in_degrees`` defines the unit of angles. A
-file begins with free header lines and ``key=value`` lines up to ``endheader``. The column names and
-the rows follow. In a table of orientations (``DataType=Quaternion``) every cell is ``w,x,y,z``, a
-rotation from body to world.
+file begins with a header of free text and ``key=value`` lines, which ends with ``endheader``. The
+column names and the rows follow. In a table of orientations (``DataType=Quaternion``) every cell is
+``w,x,y,z``, a rotation from body to world.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def read_sto(path: Path) -> TimeTable:
     Raises
     ------
     MalformedFileError
-        No ``endheader``, no column names, no rows, or a first column other than time.
+        The file has no ``endheader``, no column names or no rows, or its first column is not time.
     """
     name, header, columns, separator, body = _open(path)
     rows = rows_of_numbers(path, body, separator, len(columns))

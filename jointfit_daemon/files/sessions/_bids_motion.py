@@ -2,8 +2,9 @@
 
 A data set is a folder with one subject. Each tracking system has the files ``_motion.tsv`` (numbers
 without column names), ``_channels.tsv``, ``_motion.json`` and ``_channels.json``; events have a
-file of their own. Series with the same times form one tracking system. Its first channel (LATENCY)
-is the time since the start of the session. Joint angles are in degrees, orientations are
+file of their own. The series of one kind, for example all segments, form one tracking system if
+they have the same times. Otherwise each series is a separate tracking system. The first channel
+(LATENCY) is the time since the start of the session. Joint angles are in degrees, orientations are
 quaternions, and unknown values are ``n/a``. Source: Brain Imaging Data Structure 1.10, "Motion";
 Jeung et al. 2024, doi 10.1038/s41597-024-03559-8.
 """
@@ -114,8 +115,8 @@ def write_bids_session(session: SessionData, folder: Path) -> WrittenSession:
     _write_json(root / "dataset_description.json", description)
     facts = "".join(f"- {key}: {value}\n" for key, value in session.description.items())
     text = (
-        f"# {session.name}\n\nWritten by jointfitd {jointfit_daemon.__version__}. One tracking"
-        " system for each set of series with common times. The channel latency is the time since"
+        f"# {session.name}\n\nWritten by jointfitd {jointfit_daemon.__version__}. Series of one"
+        " kind with common times form one tracking system. The channel latency is the time since"
         f" the start of the session.\n\n{facts}"
     )
     (root / "README.md").write_text(text, encoding="utf-8")
@@ -319,8 +320,8 @@ def _read_stream(path: Path, facts: Mapping[str, Any]) -> ChannelStream | None:
         t_s = np.arange(len(table)) / rate
     else:
         raise MalformedFileError(
-            f"{path}: no channel LATENCY and no SamplingFrequency: add it to the file"
-            f" {path.with_suffix('.json').name}"
+            f"{path}: no channel LATENCY and no SamplingFrequency: add SamplingFrequency to the"
+            f" file {path.with_suffix('.json').name}"
         )
     scale = np.array([1.0 / _scale(channel) for channel in columns])
     group = facts.get("JointfitGroup")

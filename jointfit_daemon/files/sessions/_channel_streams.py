@@ -120,7 +120,7 @@ def streams_of(session: SessionData) -> list[ChannelStream]:
 
 
 def merge_streams(streams: Sequence[ChannelStream]) -> list[ChannelStream]:
-    """Merge the streams of each group whose streams all have the same times; return all streams."""
+    """Return the streams; the streams of a group become one if all of them have the same times."""
     merged = []
     for group in GROUPS:
         own = [stream for stream in streams if stream.group == group]

@@ -1,11 +1,11 @@
-"""CSV files of Xsens / Movella DOT sensors, written by the app or the exporter, one per sensor.
+"""CSV files of Xsens / Movella DOT sensors, written by the app or the exporter: a file per sensor.
 
 Lines ``NAME:,VALUE`` precede the column names. The reader uses ``DeviceTag``, ``OutputRate`` and
 ``SyncStatus``. ``SampleTimeFine`` is a 32-bit time of the row in units of 1 µs, so it wraps after
 71.6 minutes. Angular rates are in degrees per second. The world is east, north, up; quaternions
-convert from sensor to world. Output modes without rates contain increments ``dq`` and ``dv`` for
-each row. An increment divided by its period is the mean rate. Source: header and columns of
-published files and programs; no recording of the project was available.
+convert from sensor to world. Output modes without angular rate and acceleration contain increments
+``dq`` and ``dv`` for each row. An increment divided by its period is the mean rate. Source: header
+and columns of published files and programs. No recording of this project was available for tests.
 """
 
 from __future__ import annotations

@@ -167,8 +167,8 @@ def _read_folder(path: Path) -> SessionData:
     if dots:
         return read_dot_session(dots, path.name)
     raise MalformedFileError(
-        f"{path}: a folder without a Motion-BIDS data set (sub-01) and without text or CSV files of"
-        " Xsens programs: name a file"
+        f"{path}: the folder contains neither a Motion-BIDS data set (sub-01) nor text or CSV files"
+        " of Xsens programs: name a file"
     )
 
 

@@ -132,8 +132,8 @@ class _MessageBuilder:
     ) -> Iterator[_Message]:
         """Yield the poses of a coordinate frame at all instants with known values.
 
-        If `q` is None, the frame is not rotated. If `place` is None, it is at the origin of the
-        world.
+        If `q` is None, the frame is not rotated. If `place` is None, the frame is at the origin of
+        the world.
         """
         turns = np.tile([1.0, 0.0, 0.0, 0.0], (len(t_s), 1)) if q is None else q
         places = np.zeros((len(t_s), 3)) if place is None else place

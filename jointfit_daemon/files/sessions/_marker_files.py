@@ -69,7 +69,9 @@ def write_c3d_session(session: SessionData, folder: Path) -> WrittenSession:
         C3dEvent(event.t_s - offset_s, event.kind, event.id, event.text) for event in session.events
     ]
     if len(events) > MOST_ITEMS:
-        notes.append(f"{path.name}: {MOST_ITEMS} of {len(events)} events written: C3D has no more")
+        notes.append(
+            f"{path.name}: {MOST_ITEMS} of {len(events)} events written, the most that C3D permits"
+        )
 
     texts = {_FIRST: repr(first_s), _RATE: repr(axis.rate_hz)}
     if session.start_unix_ns is not None:
@@ -115,8 +117,8 @@ def read_c3d_session(path: Path) -> SessionData:
 def _markers_of(session: SessionData, kind: str) -> MarkerSeries:
     if session.markers is None or not session.markers.labels or not len(session.markers.t_s):
         raise NothingToWriteError(
-            f"session {session.name!r} has no markers, which a {kind} file holds: choose another"
-            " format, csv for example"
+            f"session {session.name!r} has no markers, so no {kind} file can be written: choose"
+            " another format, for example csv"
         )
     return session.markers
 

@@ -75,7 +75,7 @@ def _read_sensor(path: Path) -> tuple[float, SensorSeries]:
     if at is None or (_COUNTER not in lines[at] and _SAMPLE_TIME not in lines[at]):
         raise MalformedFileError(
             f"{path}: no column {_COUNTER} or {_SAMPLE_TIME} after the lines of comments: export"
-            " the recording again, with one of them"
+            " the recording again, with one of these columns"
         )
     names, columns = read_columns(path, lines, at)
 

@@ -40,8 +40,8 @@ _POSITION_PARTS = (("_x", "_y", "_z"), ("_tx", "_ty", "_tz"))
 """Endings of the names of position columns: of this project, and of OpenSim's coordinates."""
 _TRANSLATION = re.compile(r"_t?[xyz]$")
 _LATE_START_S = 1.0
-"""Longest time at the beginning of a session that is omitted, because a series has not started,
-s."""
+"""Largest difference between the starts of the series of a group, s, at which the frames before the
+last start are omitted."""
 _SAME_INSTANT_S = 1e-6
 _GROUPS = ("sensors", "segments", "optical_segments")
 
@@ -93,7 +93,7 @@ def write_sto_session(
         notes += axis.note(path.name)
         if np.isnan(table.quaternions[0]).any():
             notes.append(f"{path.name}: the first frame lacks orientations that IMUPlacer needs")
-    return _session_summary(session, "orientations, which STO files hold", files, notes)
+    return _session_summary(session, "orientations for a STO file", files, notes)
 
 
 def read_sto_session(path: Path) -> SessionData:
@@ -153,7 +153,7 @@ def write_mot_session(session: SessionData, folder: Path) -> WrittenSession:
         if written.frames:
             files.append(written.path)
         notes += [*written.notes, *axis.note(path.name)]
-    return _session_summary(session, "joints, which MOT files hold", files, notes)
+    return _session_summary(session, "joints for a MOT file", files, notes)
 
 
 def read_mot_session(path: Path) -> SessionData:
@@ -244,7 +244,7 @@ def _session_summary(
     if not files:
         reason = f": {notes[0]}" if notes else ""
         raise NothingToWriteError(
-            f"session {session.name!r} has no {contents}{reason}: choose another format, csv for"
-            " example"
+            f"session {session.name!r} has no {contents}{reason}: choose another format, for"
+            " example csv"
         )
     return WrittenSession(tuple(files), tuple(notes))

@@ -55,7 +55,7 @@ TABLES: Mapping[str, tuple[str, ...]] = {
 }  # fmt: skip
 """Columns of every table. Only the table ``session`` is present in every session."""
 _SOURCES = {"imu": "", "optical": "optical_"}
-"""Prefix in the names of groups of series, by the source of the data: sensors or markers."""
+"""Prefix of the attributes ``segments`` and ``joints`` of a session, by source of the data."""
 _NAME, _START, _DESCRIPTION = "name", "start_unix_ns", "description."
 
 

@@ -1,7 +1,7 @@
 """Series on one uniform time axis, for formats that have a single rate.
 
 If the instants of a series lie on the axis, its rows are used unchanged, and missing rows become
-unknown values. Other series are interpolated linearly, and orientations along the shortest
+unknown values. Other series are interpolated: values linearly, orientations along the shortest
 rotation.
 """
 

@@ -176,7 +176,7 @@ def read_xdf_session(path: Path) -> SessionData:
     Raises
     ------
     MalformedFileError
-        The file is not an XDF file, is damaged, or contains no such stream.
+        The file is not an XDF file, is damaged, or contains none of these streams.
     """
     header, found = read_xdf_streams(path)
     start = (header.findtext("start_unix_ns") or "").strip()

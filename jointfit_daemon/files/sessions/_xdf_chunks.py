@@ -1,4 +1,4 @@
-"""Chunks of XDF files: reading of chunks, and of streams with samples and clock offsets.
+"""Chunks of XDF files: packing of chunks, and reading of streams from the chunks.
 
 A file is ``XDF:`` followed by chunks. A chunk consists of the number of length bytes (1, 4 or 8),
 the length, a 16-bit tag and the content. Source: https://github.com/sccn/xdf/wiki/Specifications.

@@ -1,4 +1,4 @@
-"""Bounded reading of TOML and JSON files from untrusted sources.
+"""Reading of TOML and JSON files from untrusted sources, with limited size and depth.
 
 Invariant: the only exception that a file causes is `MalformedFileError`. Readers read at most
 `most_bytes`, never wait for a writer, and reject values nested so deeply that later code would
@@ -54,7 +54,7 @@ def read_toml(path: Path, most_bytes: int = MOST_BYTES) -> dict[str, Any]:
     Raises
     ------
     MalformedFileError
-        Not readable, not a regular file, too large, not UTF-8, or not TOML.
+        The file cannot be read, is a directory or device, is too large, or is not UTF-8 or TOML.
     """
     table: dict[str, Any] = _parse_text(path, "TOML", parse_toml, read_text(path, most_bytes))
     return table
@@ -66,7 +66,7 @@ def read_json(path: Path, most_bytes: int = MOST_BYTES) -> Any:
     Raises
     ------
     MalformedFileError
-        Not readable, not a regular file, too large, not UTF-8, or not JSON.
+        The file cannot be read, is a directory or device, is too large, or is not UTF-8 or JSON.
     """
     return _parse_text(path, "JSON", parse_json, read_text(path, most_bytes))
 
@@ -77,7 +77,7 @@ def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
     Raises
     ------
     MalformedFileError
-        Not readable, not a regular file, too large, or not UTF-8.
+        The file cannot be read, is a directory or device, is too large, or is not UTF-8.
     """
     data = read_bounded(path, most_bytes)
     try:
@@ -99,7 +99,7 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
     Raises
     ------
     MalformedFileError
-        Not readable, not a regular file, or larger than `most_bytes`.
+        The file cannot be read, is a directory or device, or is larger than `most_bytes`.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY)
@@ -131,9 +131,9 @@ def parse_toml(text: str) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        Not TOML.
+        The text is not TOML.
     RecursionError
-        Nested too deeply.
+        The text is nested too deeply.
     """
     # tomllib needs time and memory that grow with the square of the number of parts of a dotted
     # key.
@@ -148,9 +148,9 @@ def parse_json(text: str) -> Any:
     Raises
     ------
     ValueError
-        Not JSON, or contains NaN or infinity.
+        The text is not JSON, or contains NaN or infinity.
     RecursionError
-        Nested too deeply.
+        The text is nested too deeply.
     """
     try:
         return json.loads(text, parse_constant=_refuse_constant)

@@ -52,7 +52,7 @@ def read_lines(path: Path) -> list[str]:
 
 
 def reject_device(path: Path) -> None:
-    """Raise an error for devices and sockets, which may never end.
+    """Raise an error for devices and sockets, whose data may never end.
 
     Raises
     ------
@@ -137,7 +137,7 @@ def require_times(path: Path, t_s: NDArray[np.float64]) -> None:
         The table has no rows, or a time is missing.
     """
     if not len(t_s):
-        raise MalformedFileError(f"{path}: a header without rows of data: export the trial again")
+        raise MalformedFileError(f"{path}: contains no rows of data: export the trial again")
     if not np.isfinite(t_s).all():
         row = int(np.argmin(np.isfinite(t_s))) + 1
         raise MalformedFileError(

@@ -13,9 +13,10 @@
 
 A sensor report begins with four fields: id, sequence, status and delay. Bits 0..1 of the status are
 the accuracy, and bits 2..7 are the high bits of the delay. A packet begins with report FB, which
-contains the time between a base and the transmission of the packet. This time and the delay are in
-units of 100 us. The time of measurement is transmission - base + delay. The report FA shifts the
-base. Gyro rotation vectors are sent on a separate channel and consist only of their values.
+contains the time from a reference instant, the base, to the transmission of the packet. The delay
+is the time from the base to the measurement. Both times are in units of 100 us. The report FA
+shifts the base. Gyro rotation vectors are sent on a separate channel and consist only of their
+values.
 
 Sources: SH-2 reference manual 1000-3625. Lengths and the sign of times are from the vendor's host
 library (sh2, Apache-2.0).
@@ -79,7 +80,7 @@ _SCALES: dict[int, tuple[float, ...]] = {
     HubReportId.GAME_ROTATION_VECTOR: (_Q14,) * 4,
     HubReportId.ARVR_GAME_ROTATION_VECTOR: (_Q14,) * 4,
 }
-"""SI value of one count, for each field of each report."""
+"""Value of one count, for each field of each report, in the units of the table above."""
 _LENGTHS: dict[int, int] = {
     0x01: 10, 0x02: 10, 0x03: 10, 0x04: 10, 0x05: 14, 0x06: 10, 0x07: 16, 0x08: 12, 0x09: 14,
     0x0A: 8, 0x0B: 8, 0x0C: 6, 0x0D: 6, 0x0E: 6, 0x0F: 16, 0x10: 5, 0x11: 12, 0x12: 6, 0x13: 6,
@@ -104,11 +105,11 @@ class HubReport(NamedTuple):
     sequence: int
     """Sequence number of the report for this sensor, modulo 256."""
     status: int
-    """Status of the report; bits 0 and 1 are the accuracy."""
+    """Accuracy, from bits 0 and 1 of the status; an index of `ACCURACY`."""
     delay: int
     """Time from the base to the measurement, in units of 100 us."""
     values: tuple[float, ...]
-    """Measured values in SI units, in the order of the table at the top of this module."""
+    """Measured values, in the order and the units of the table at the top of this module."""
 
 
 def split_reports(payload: bytes) -> list[bytes] | None:
@@ -150,7 +151,7 @@ def decode_report(report: bytes) -> HubReport | None:
 
 
 def decode_gyro_rotations(payload: bytes) -> list[tuple[float, ...]] | None:
-    """Return i j k real, and the rate of turn, rad/s, of each gyro rotation vector of a packet.
+    """Return i j k real, and the angular rate, rad/s, of each gyro rotation vector of a packet.
 
     Return None if the vectors do not fill the packet.
     """
@@ -163,7 +164,7 @@ def decode_gyro_rotations(payload: bytes) -> list[tuple[float, ...]] | None:
 
 
 def encode_gyro_rotation(values: tuple[float, ...]) -> bytes:
-    """Return a gyro rotation vector of i j k real and the rate of turn; values are limited."""
+    """Return the bytes of i j k real and the angular rate. Values out of range are clipped."""
     counts = [round(v / s) for v, s in zip(values, _GYRO_ROTATION_SCALES, strict=True)]
     return _GYRO_ROTATION.pack(*(max(-32768, min(32767, count)) for count in counts))
 
@@ -181,7 +182,7 @@ def encode_report(report: HubReport) -> bytes:
 
 
 def base_time(report: bytes) -> int | None:
-    """Return the shift of the base by a report FB or FA, in units of 100 us, or None."""
+    """Return the shift of the base by a report FB or FA, in units of 100 us; None for others."""
     if report[0] not in {HubReportId.BASE_TIME, HubReportId.TIME_REBASE}:
         return None
     kind, value = _BASE.unpack(report)
@@ -205,7 +206,7 @@ def feature_request(report_id: int) -> bytes:
 
 
 def encode_feature(report_id: int, interval_us: int, *, response: bool = False) -> bytes:
-    """Return the command that sets the interval of a report, us, or the response to it.
+    """Return the command that sets the interval of a report, us, or the response to this command.
 
     An interval of 0 switches the report off. The settings are lost at a reset.
     """

@@ -27,8 +27,8 @@ _MARKS = b"\xaa\xaa"
 _BODY = struct.Struct("<B6h3s")
 _unpack, _new_tuple = _BODY.unpack_from, tuple.__new__
 _RUN = 1024
-"""Number of noise bytes after which a run is reported, so that the number of corrupt bytes is
-current."""
+"""Number of noise bytes after which a run is reported, so that the number of corrupt bytes is up to
+date."""
 _START = re.compile(b"\xaa")
 _NO_START = CorruptBytes(1, "no frame starts here")
 _CHECKSUM = CorruptBytes(1, CHECKSUM)
@@ -47,8 +47,8 @@ class RvcFrame(NamedTuple):
     """Specific force along x, y, z, 1/1000 g."""
     reserved: bytes = bytes(3)
     end: int = 0
-    """Number of bytes fed to the codec until the end of the checksum, for back-dating of the
-    message."""
+    """Number of bytes fed to the codec until the end of the checksum. Drivers compute the
+    arrival time of the first byte from this number."""
 
     @property
     def size(self) -> int:

@@ -62,8 +62,8 @@ class ShtpPacket(NamedTuple):
     size: int = 0
     """Length on the wire, including both flags, bytes."""
     end: int = 0
-    """Number of bytes fed to the codec until the end of the closing flag, for back-dating of the
-    message."""
+    """Number of bytes fed to the codec until the end of the closing flag. Drivers compute the
+    arrival time of the first byte from this number."""
 
 
 class ShtpBufferStatus(NamedTuple):
@@ -105,8 +105,8 @@ def _encode_frame(protocol: int, data: bytes) -> bytes:
 class ShtpCodec:
     """Codec that converts a byte stream to packets; the stream may be split at any position.
 
-    If the bytes between two flags form no packet, they become one `CorruptBytes`. Flags are counted
-    separately.
+    If the bytes between two flags form neither a packet nor a buffer status, they become one
+    `CorruptBytes`. Flags are counted separately.
     """
 
     def __init__(self) -> None:
@@ -180,7 +180,7 @@ class ShtpCodec:
 
 
 def _unescape(segment: bytes) -> bytes | None:
-    """Return the bytes of a frame; None if an escape is at the end or escapes an escape."""
+    """Return the bytes of a frame; None if an escape is last or directly before another escape."""
     if ESCAPE not in segment:
         return segment
     first, *rest = segment.split(_ESCAPE)

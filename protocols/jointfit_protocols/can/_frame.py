@@ -1,8 +1,8 @@
 """CAN frames as records of fixed size, which form the data of a CAN chunk.
 
-A driver with ``wire = "can"`` receives such chunks. A record has 24 bytes and contains the stamp of
-its frame. A chunk with many frames therefore contains all stamps, and a recording of chunks can be
-replayed exactly.
+The decoder of a driver with ``wire = "can"`` receives such chunks. A record has 24 bytes and
+contains the stamp of its frame. A chunk with many frames therefore contains all stamps, and a
+recording of chunks can be replayed exactly.
 
      0        8          12      13     14    16         24
     | t_ns i64 | id u32   | flags | size | zero | data[8] |   little-endian

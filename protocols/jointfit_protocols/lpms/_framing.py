@@ -5,7 +5,7 @@
 
 Numbers are little-endian. LRC is the 16-bit sum of identifier, command, n and data. The vendor's
 documents permit two interpretations: the sum of all bytes, or the sum of the 16-bit words of the
-head and the bytes of the data. Both sums are equal while identifier, command and n are below 256.
+head and the bytes of the data. Both sums are equal if identifier, command and n are below 256.
 The codec accepts both, and sends the sum of the bytes.
 
 Source: protocol pages of the vendor's knowledge base; OpenZen (MIT) for the two sums.
@@ -44,8 +44,8 @@ class LpBusMessage(NamedTuple):
     command: int
     data: bytes
     end: int = 0
-    """Number of bytes fed to the codec until the end of the message, for back-dating of the
-    message."""
+    """Number of bytes fed to the codec until the end of the message. Drivers compute the
+    arrival time of the first byte from this number."""
 
     @property
     def size(self) -> int:

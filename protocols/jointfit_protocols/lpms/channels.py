@@ -9,9 +9,9 @@ the channels of w, x, y and z are settings. The sensor cannot send a time or a s
 A quaternion in two frames is complete only if the frames follow each other in order and within half
 a period. Halves from different instants would yield a wrong orientation.
 
-The two modes differ only in the identifiers. CANopen style uses 0x180, 0x280, 0x380 and 0x480 plus
-the node number, and a heartbeat at 0x700 plus the node number. In sequential mode, the identifiers
-follow a start identifier by one of two rules (`sequential_ids`).
+A sensor has two modes, which differ only in the identifiers. CANopen style uses 0x180, 0x280, 0x380
+and 0x480 plus the node number, and a heartbeat at 0x700 plus the node number. In sequential mode,
+the identifiers follow a start identifier by one of two rules (`sequential_ids`).
 
 Source: the vendor's page on CAN parsing for LPMS3; firmware source of 2013.
 

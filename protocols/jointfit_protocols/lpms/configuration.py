@@ -74,7 +74,7 @@ class CommandTable:
     """Outputs in the order in which a data packet contains them."""
     rates_hz: tuple[int, ...]
     tick_hz: int
-    """Default unit of the device time, ticks per second."""
+    """Default rate of the device time, ticks per second."""
     set_outputs: int
     set_rate: int
     set_precision: int
@@ -216,7 +216,7 @@ def encode_configuration(
 
 
 def set_command(table: CommandTable, part: LpmsConfiguration) -> list[tuple[int, bytes]]:
-    """Return the commands with their data that set all known settings of `part`."""
+    """Return the commands, each with its data, that set all known settings of `part`."""
     commands = []
     if part.outputs is not None:
         commands.append((table.set_outputs, _WORD.pack(part.outputs)))
@@ -224,7 +224,7 @@ def set_command(table: CommandTable, part: LpmsConfiguration) -> list[tuple[int,
         commands.append((table.set_rate, _WORD.pack(part.rate_hz)))
     if part.floats is not None:
         # The flag for 16 or 32 bits has opposite meanings in the two generations.
-        value = part.floats if table.generation == 3 else not part.floats  # noqa: PLR2004 - a generation, or ASCII
+        value = part.floats if table.generation == 3 else not part.floats  # noqa: PLR2004 - a generation
         commands.append((table.set_precision, _WORD.pack(int(value))))
     return commands
 
@@ -239,7 +239,7 @@ def decode_set(table: CommandTable, command: int, data: bytes) -> LpmsConfigurat
     if command == table.set_rate:
         return LpmsConfiguration(rate_hz=word)
     if command == table.set_precision:
-        return LpmsConfiguration(floats=bool(word) == (table.generation == 3))  # noqa: PLR2004 - a generation, or ASCII
+        return LpmsConfiguration(floats=bool(word) == (table.generation == 3))  # noqa: PLR2004 - a generation
     return None
 
 
@@ -272,7 +272,7 @@ def identify_generation(data: bytes) -> Generation | None:
     if len(data) == _WORD.size and data[1:] == bytes(3):
         return 3
     text = data.rstrip(b"\0")
-    return 1 if text and all(0x20 <= byte < 0x7F for byte in text) else None  # noqa: PLR2004 - a generation, or ASCII
+    return 1 if text and all(0x20 <= byte < 0x7F for byte in text) else None  # noqa: PLR2004 - ASCII
 
 
 def decode_text(data: bytes) -> str:

@@ -42,7 +42,7 @@ class StreamDescription(NamedTuple):
     source_id: str
     hostname: str
     channels: tuple[Channel, ...]
-    """Described channels. There are none or `channel_count`."""
+    """Description of every channel; empty unless the stream describes all channels."""
     manufacturer: str
     model: str
     compensated_lag_s: float

@@ -46,8 +46,8 @@ class MipPacket(NamedTuple):
     size: int
     """Length of the packet on the wire, bytes."""
     end: int = 0
-    """Number of bytes fed to the codec until the end of the checksum, for back-dating of the
-    message."""
+    """Number of bytes fed to the codec until the end of the checksum. Drivers compute the
+    arrival time of the first byte from this number."""
 
 
 def encode(descriptor_set: int, fields: Iterable[MipField]) -> bytes:

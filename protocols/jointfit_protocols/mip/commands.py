@@ -1,8 +1,8 @@
 """MIP commands and replies that configure a device.
 
 A command packet has one field. Its reply contains the field 0xF1, ``command | code``. Replies to
-commands that read also contain a field with the values. Most commands begin with a function: 1
-write, 2 read, 3 save, 4 load, 5 default. Settings are volatile until they are saved.
+read commands also contain a field with the values. Most commands begin with a function: 1 write, 2
+read, 3 save, 4 load, 5 default. Settings are volatile until they are saved.
 
 The two families of devices use different commands for the same settings:
 
@@ -35,7 +35,7 @@ Family = Literal["current", "legacy"]
 REPLY = 0xF1
 """Descriptor of the field with command and code, which every reply contains."""
 REPLY_BYTES = 2
-"""Size of the data of this field, bytes."""
+"""Size of the data of the field `REPLY`, bytes."""
 OK, UNKNOWN_COMMAND = 0, 1
 CODES = {
     UNKNOWN_COMMAND: "unknown command",

@@ -5,7 +5,7 @@
 | any, 0xD0   | event source: 0 scheduled, otherwise the number of a trigger                  |
 | any, 0xD3   | GPS time of week s, week, flags: 1 time of week valid, 2 week valid           |
 | any, 0xD5   | reference time, ns since start; monotonic                                     |
-| any, 0xD6   | ns since the last such field                                                  |
+| any, 0xD6   | ns since the previous field 0xD6                                              |
 | any, 0xD7   | external time ns, flag: valid                                                 |
 | 0x80, 0x04  | acceleration (specific force), g                                              |
 | 0x80, 0x05  | angular rate, rad/s                                                           |

@@ -59,7 +59,7 @@ def decode_connect(data: bytes) -> Connect | None:
 
 
 def encode_connect(connect: Connect) -> bytes:
-    """Return the payload of a request in the form that the request has.
+    """Return the payload of a request, which has the length `connect.form`.
 
     Raises
     ------

@@ -4,7 +4,7 @@
     timecode | sub-frame | timestamp | exposure | received | transmit | [precision] | params | 0
 
 Numbers are little-endian and packed. Each section starts with the number of its items (``i32 n``).
-From bitstream 4.1 on, the size of the items follows (``i32 bytes``), and there are assets.
+From bitstream 4.1 on, the size of the items follows (``i32 bytes``), and the section assets exists.
 Positions are in metres in the server's world, and quaternions have the order x, y, z, w.
 
 Source: NaturalPoint NatNet SDK 4.1, NatNetTypes.h and PythonClient.
@@ -81,7 +81,8 @@ class LabeledMarker(NamedTuple):
     z: float
     size: float
     params: int
-    """Flags ``MARKER_``. A usable marker is not occluded and is point-cloud solved."""
+    """Flags, see the constants ``MARKER_``. A usable marker is not occluded, and has the flag
+    `MARKER_POINT_CLOUD_SOLVED`."""
     residual: float
     """Residual of the marker, metres per camera ray."""
 
@@ -186,7 +187,7 @@ def _read_section(
 ) -> tuple[Any, ...]:
     """Read one section.
 
-    If `skipped` is given, skip a section that does not have its stated size.
+    If `skipped` is given, skip a section that does not have its stated size, and append its name.
     """
     n = cursor.integer()
     if skipped is None:

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from jointfit_protocols.natnet._frame import Analog
 
 FLAGGED: Version = (2, 6)
-"""First bitstream whose frames contain params."""
+"""First bitstream whose frames contain flags (``params``)."""
 _LONG_TIMESTAMP: Version = (2, 7)
 _PLATES: Version = (2, 9)
 _DEVICES: Version = (2, 11)

@@ -104,7 +104,7 @@ class FrameLayout:
             The frame as received, the decoded frame, and its bitstream version.
         selected : frozenset of str, optional
             Names of the marker sets to read. By default everything is read. A server repeats each
-            marker in two sets, and reading both takes as long as the rest of a frame.
+            marker in two sets. To read both sets takes as long as to read the rest of a frame.
         """
         if frame.skeletons or frame.assets or frame.force_plates or frame.devices or frame.skipped:
             return None

@@ -33,7 +33,7 @@ class Timecode(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Timecode as text, ``HH:MM:SS:FF``."""
+        """Timecode as text, ``HH:MM:SS:FF``, with the subframe after a dot unless it is 0."""
         parts = f"{self.hour:02d}:{self.minute:02d}:{self.second:02d}:{self.frame:02d}"
         return f"{parts}.{self.subframe}" if self.subframe else parts
 

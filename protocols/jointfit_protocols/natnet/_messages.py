@@ -251,7 +251,7 @@ _READERS: dict[int, Callable[[bytes], Message | None]] = {
 # --- writing ----------------------------------------------------------------------------------
 
 
-def _payload(message: Message, version: Version) -> tuple[NatNetMessageId, bytes]:  # noqa: C901, PLR0911 - one case a message
+def _payload(message: Message, version: Version) -> tuple[NatNetMessageId, bytes]:  # noqa: C901, PLR0911 - one case per message
     match message:
         case FrameOfData():
             return NatNetMessageId.FRAMEOFDATA, encode_frame(message, version)

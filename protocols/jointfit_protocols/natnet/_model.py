@@ -2,7 +2,7 @@
 
     i32 n, then n x { i32 type, [>= 4.1: i32 bytes], description }
 
-From bitstream 4.1 on, the size permits every description to be skipped, even an unknown one. In
+From bitstream 4.1 on, every description can be skipped by its size, even if its type is unknown. In
 older bitstreams, an unknown type ends the decoding. The earlier descriptions are returned, and
 `ModelDefinition.complete` is false. Some 4.2 servers send a quaternion after the offset, which only
 one client documents. The size of the description shows whether it is present.
@@ -213,7 +213,7 @@ class _Reader:
         self._named = version >= NAMES_FROM
         self._rotated = rotated
 
-    def description(self, kind: int) -> Description | None:  # noqa: PLR0911 - one case a type
+    def description(self, kind: int) -> Description | None:  # noqa: PLR0911 - one case per type
         """Read a description of type `kind`; None if the type is unknown."""
         cursor = self._cursor
         text, integer = cursor.text, cursor.integer

@@ -45,7 +45,7 @@ def encode_model(model: ModelDefinition, version: Version) -> bytes:
     return b"".join(parts)
 
 
-def _put(description: Description, version: Version) -> tuple[int, bytes]:  # noqa: PLR0911 - one case a type
+def _put(description: Description, version: Version) -> tuple[int, bytes]:  # noqa: PLR0911 - one case per type
     match description:
         case MarkerSetDescription():
             names = put_texts(description.markers)
@@ -91,7 +91,7 @@ def _put_body(body: BodyDescription, version: Version) -> bytes:
         return put_text(body.name) + head
     n = len(body.positions)
     if len(body.labels) != n or (version >= NAMES_FROM and len(body.markers) != n):
-        raise ValueError(f"{body.name}: as many labels and names as markers are needed")
+        raise ValueError(f"{body.name}: expected one label and one name for each marker")
     markers = [XYZ.pack(*position) for position in body.positions]
     labels = [I32.pack(label) for label in body.labels]
     names = [put_text(name) for name in body.markers] if version >= NAMES_FROM else []

@@ -40,7 +40,8 @@ ITEM_LAYOUTS: dict[int, Struct] = {
     ComponentType.BODIES_EULER: Struct("<6f"),
     ComponentType.BODIES_EULER_RESIDUAL: Struct("<7f"),
 }
-"""Layout of one marker or body of each type: position, followed by id, rotation and residual."""
+"""Layout of one marker or body, by type: position, then id, rotation or residual if the type has
+them."""
 
 COMPONENT_HEAD = Struct("<II")
 """Layout of the head of a component: size and type."""

@@ -27,8 +27,8 @@ class QtmBody(NamedTuple):
 
     name: str
     enabled: bool = True
-    """Whether the body is tracked. It is always true below version 1.24, which has no such
-    element."""
+    """Whether the body is tracked. Always true below version 1.24, because the element is
+    missing."""
     relative: bool = False
     """Whether the pose of the body is relative to another body instead of the world."""
     fixed: bool = False

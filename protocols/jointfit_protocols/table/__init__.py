@@ -1,4 +1,4 @@
-"""Messages that a table describes: binary frames and text lines on serial ports, and CAN frames."""
+"""Messages that a table of rig.toml describes: frames and lines on serial ports, and CAN frames."""
 
 from jointfit_protocols.table._can_frames import (
     CanSample,

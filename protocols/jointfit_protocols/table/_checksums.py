@@ -45,14 +45,14 @@ class Checksum(NamedTuple):
 
     kind: ChecksumKind
     first: int = 0
-    """First byte of the frame that the checksum includes. The last included byte is the byte before
-    the checksum."""
+    """Index of the first byte of the frame that the checksum includes. The last included byte is
+    the byte before the checksum."""
     byte_order: ByteOrder = "little"
     """Byte order of the checksum in the frame. For fletcher16, ``little`` means that the plain sum
     is first."""
     polynomial: int | None = None
     """CRC polynomial without the highest bit, not reflected. None selects 0x07, 0x1021 or
-    0x04C11DB7."""
+    0x04C11DB7, depending on the kind."""
     init: int = 0
     reflected: bool = False
     """Whether the CRC processes each byte from its least significant bit on."""

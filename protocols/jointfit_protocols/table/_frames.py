@@ -51,8 +51,8 @@ class FrameFormat(NamedTuple):
     end: bytes = b""
     """Bytes with which every frame ends."""
     message: tuple[TableField, int] | None = None
-    """Type field and its value in frames with measurements. None means that all frames have
-    them."""
+    """Type field and its value in frames with measurements. None means that all frames contain
+    measurements."""
 
 
 _NO_START = CorruptBytes(1, NO_START)

@@ -1,4 +1,4 @@
-"""Messages that the serial codecs of tables return."""
+"""Message that the codecs of frames and lines return."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ class TableMessage(NamedTuple):
     data: bytes
     """Bytes of the message on the wire."""
     end: int
-    """Number of bytes fed to the codec until the end of the message, for back-dating of the
-    message."""
+    """Number of bytes fed to the codec until the end of the message. Drivers compute the
+    arrival time of the first byte from this number."""
 
     @property
     def size(self) -> int:

@@ -62,7 +62,8 @@ class BinaryPacket(NamedTuple):
     size: int
     """Length of the message on the wire, bytes."""
     end: int = 0
-    """Number of bytes fed to the codec until the end of the CRC, for back-dating of the message."""
+    """Number of bytes fed to the codec until the end of the CRC. Drivers compute the
+    arrival time of the first byte from this number."""
 
 
 VectorNavMessage = BinaryPacket | TextMessage

@@ -21,7 +21,7 @@ PACKET = 0x1A2B0001
 LARGEST_PACKET = 16 << 20
 """Largest accepted packet, bytes."""
 TICKS_PER_S = 135_000_000
-"""Number of ticks per second in which the frame period is given."""
+"""Number of ticks per second. The server states the frame period in these ticks."""
 
 
 class ObjectId(IntEnum):

@@ -121,9 +121,9 @@ class _Cursor:
 
 
 def decode_object(kind: int, data: memoryview) -> Object | str:
-    """Return the object with an id, or the reason why its body is corrupt.
+    """Return the object with the id `kind`, or the reason why its body is corrupt.
 
-    An optional object whose body is shorter than known becomes an `OpaqueObject`.
+    An optional object whose body is shorter than expected becomes an `OpaqueObject`.
     """
     read = _READERS.get(kind)
     if read is None:

@@ -3,7 +3,8 @@
 A server sends messages by TCP and in UDP datagrams. A datagram contains only complete messages. If
 the caller feeds only complete messages of the TCP stream (`whole_messages`), it can feed datagrams
 in between. A message has no start pattern and no checksum. After an impossible length, everything
-up to the next cookie is discarded, and a driver closes the connection.
+up to the next cookie (the first bytes of a connection) is discarded, and a driver closes the
+connection.
 
 Invariant: the codec converts bytes to messages. It uses no socket and no clock, and the boundaries
 of the byte strings do not matter. At most one incomplete message is stored, and at most `MAX_IDS`
@@ -201,7 +202,7 @@ class VrpnCodec:
 
     # --- messages -----------------------------------------------------------------------------
 
-    def _content(  # noqa: PLR0911 - one case a type
+    def _content(  # noqa: PLR0911 - one case per type
         self, seconds: int, micros: int, sender: int, kind: int, body: bytes
     ) -> VrpnContent | str:
         """Return the content of one message, or the reason why it is rejected."""

@@ -48,8 +48,8 @@ def encode(
     message : VrpnContent
         Message to encode.
     types : mapping of str to int, optional
-        Numbers by which this side has described its types. Tracker and heartbeat messages need
-        them.
+        Number that this side has given to each message type, by name. Tracker messages, `Ping` and
+        `Pong` need these numbers.
     sequence : int
         Sequence number of the message in this connection.
     time_us : int
@@ -80,7 +80,7 @@ def encode_announcement(announcement: Announcement) -> bytes:
     return f"{announcement.host} {announcement.port}\0".encode()
 
 
-def _parts(  # noqa: PLR0911 - one case a type
+def _parts(  # noqa: PLR0911 - one case per type
     message: VrpnContent, types: Mapping[str, int]
 ) -> tuple[int, int, bytes]:
     """Return sender, type and body of a message."""

@@ -136,7 +136,7 @@ class TrackerMotion(NamedTuple):
     qy: float
     qz: float
     qw: float
-    """Rotation during `interval_s`; for an acceleration, its change per second."""
+    """Rotation during `interval_s`; for an acceleration, the change of this rotation per second."""
     interval_s: float
 
 

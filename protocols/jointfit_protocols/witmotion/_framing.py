@@ -4,7 +4,7 @@
     | 55 | kind | 8 bytes of data | sum of bytes 0..9 mod 256 |      kind 50..5F, 11 bytes
 
 Bluetooth and SD models send another variant: 55 61 and 18 or 26 bytes of data without a checksum.
-This variant contains no quaternion, and is only recognised.
+This variant contains no quaternion. Its frames are only counted.
 
 Source: protocol pages of the vendor (Standard Communication Protocol).
 
@@ -28,8 +28,8 @@ _OTHER_KIND = 0x61
 _OTHER_SIZES = (20, 28)
 """Distances between the starts of 55 61 frames, bytes."""
 _RUN = 1024
-"""Number of noise bytes after which a run is reported, so that the number of corrupt bytes is
-current."""
+"""Number of noise bytes after which a run is reported, so that the number of corrupt bytes is up to
+date."""
 _AT_START = re.compile(b"\x55")
 _NO_START = CorruptBytes(1, "no frame starts here")
 _CHECKSUM = CorruptBytes(1, CHECKSUM)
@@ -60,8 +60,8 @@ class WitMotionFrame(NamedTuple):
     data: bytes
     """Eight bytes of data."""
     end: int = 0
-    """Number of bytes fed to the codec until the end of the checksum, for back-dating of the
-    message."""
+    """Number of bytes fed to the codec until the end of the checksum. Drivers compute the
+    arrival time of the first byte from this number."""
 
 
 def encode(kind: int, data: bytes) -> bytes:

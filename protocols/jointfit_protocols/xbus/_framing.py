@@ -34,7 +34,7 @@ _HEAD = 4
 
 
 class XbusMessageId(IntEnum):
-    """Message identifiers. The identifier of a reply is that of its request plus one."""
+    """Message identifiers. The identifier of a reply is the identifier of its request plus one."""
 
     REQ_DEVICE_ID = 0x00
     DEVICE_ID = 0x01
@@ -92,8 +92,8 @@ class XbusMessage(NamedTuple):
     data: bytes
     bid: int = MASTER
     end: int = 0
-    """Number of bytes fed to the codec until the end of the checksum, for back-dating of the
-    message."""
+    """Number of bytes fed to the codec until the end of the checksum. Drivers compute the
+    arrival time of the first byte from this number."""
 
     @property
     def size(self) -> int:

@@ -1,6 +1,6 @@
 """Items of an MTData2 message, with counts and floats as sent and without conversion of units.
 
-    | DataID U2 | size U1 | size bytes |   repeated; the run ends exactly at the end of the message
+    | DataID U2 | size U1 | size bytes |   repeated; the last item ends exactly with the message
 
 The low four bits of the DataID of a real-valued item define its encoding and its world:
 

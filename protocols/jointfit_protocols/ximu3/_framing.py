@@ -1,7 +1,7 @@
 """Conversion of the bytes of an x-IMU3 to messages, which are lines that end with LF.
 
-A line that is not a message may still end with a message, because the terminator before the message
-was lost. The end of such a line is therefore searched for a message at every byte.
+A line that is not a message may still end with a message, if the terminator before the message was
+lost. The end of such a line is therefore searched for a message at every byte.
 
 Invariant: the codec converts bytes to messages. It uses no port and no clock, and the boundaries of
 the byte strings do not matter.

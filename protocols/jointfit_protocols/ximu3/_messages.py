@@ -33,7 +33,8 @@ MULTIPLEXER = 0x5E
 OBJECT = 0x7B
 """First byte of a command or reply, which is an opening brace."""
 MOST_CHANNELS = 3
-"""Largest number of multiplexers in series. A message that passed more is treated as corrupt."""
+"""Largest number of multiplexers in series. A message that passed through more of them counts as
+corrupt."""
 _BINARY = 0x80
 _HEAD = struct.Struct("<BQ")
 _TICKS = 1 << 64
@@ -117,7 +118,8 @@ class XImu3Data(NamedTuple):
     size: int = 0
     """Length of the message on the wire, bytes."""
     end: int = 0
-    """Number of bytes fed to the codec until the end of the terminator, for back-dating."""
+    """Number of bytes fed to the codec until the end of the terminator. Drivers compute the
+    arrival time of the first byte from this number."""
     channel: int | None = None
     """Channel of the multiplexer; None for a message of the device itself."""
 
