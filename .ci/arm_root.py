@@ -40,7 +40,8 @@ if TYPE_CHECKING:
 PYTHONS = {"bookworm": "3.11", "trixie": "3.13"}
 """Python version of each release of Debian."""
 GLIBC = "manylinux_2_34"
-"""Newest platform tag of wheels for the libraries of the tests; Debian 12 has glibc 2.36."""
+"""Platform tag with the newest glibc (2.34) that the wheels of the test libraries may need. Debian
+12 has glibc 2.36."""
 MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
 TESTS = [
     f"tests/{name}"
@@ -51,7 +52,7 @@ TESTS = [
 ]  # fmt: skip
 """Tests of the packages that compute, in order of their duration."""
 FAST = "not system and not experiment and not alone and not real_time and not vm"
-"""Selects the tests without time limits and without other processes."""
+"""Marker expression for the tests without time limits and without other processes."""
 NOT_IN_EMULATION = (
     "tests/drivers/natnet/test_natnet_diagnosis.py",
     "tests/drivers/natnet/test_natnet_session.py",
@@ -59,13 +60,13 @@ NOT_IN_EMULATION = (
     "tests/drivers/ports/test_python_can_bus.py::test_link_down_is_reported_once",
     "tests/calibration/phases/test_functional_fit.py::test_correction_has_smaller_errors",
 )
-"""Tests that need socket options or CAN errors that QEMU's user emulation lacks, such as
-IP_MULTICAST_IF and SO_MEMINFO, or that limit the processor time. Beginnings of their names."""
+"""Beginnings of the names of tests that fail in QEMU's user emulation. They need socket options
+that it lacks (IP_MULTICAST_IF, SO_MEMINFO), need CAN errors, or limit the processor time."""
 PACKAGED = ("jointfit_daemon", "drivers", "protocols", "simulators", "jointfit_variant.py")
 """Paths of the checkout that the tests must import from the package."""
 FIT_TOLERANCE = 1e-9
-"""Largest relative difference of a fitted number; below one, the difference is absolute. The
-libraries of the two machines round differently."""
+"""Largest accepted difference between the numbers of the two fits: relative for numbers above 1,
+absolute for smaller numbers. The libraries of the two machines round differently."""
 RECORD = """\
 import pathlib, sys
 from tests.reprocessing.recorded_run import record_run
@@ -89,8 +90,8 @@ step 'jointfit doctor'
 step 'jointfit replay recording --verify'
 step 'jointfit calibrate --recording recording --out fitted.json'
 """
-"""Shell commands before the tests. The package imports the libraries of the tests after its own,
-because it searches /usr/local/lib/jointfitd for drivers of others."""
+"""Shell commands before the tests. The libraries of the tests are in /usr/local/lib/jointfitd, the
+folder for drivers of others, because the package searches it after its own libraries."""
 PYTEST = (
     "/usr/lib/jointfitd/bin/python3 -m pytest -q -p no:cacheprovider -p tests.older_scipy"
     " -o timeout=0 -o pythonpath=."
@@ -138,7 +139,7 @@ def main() -> int:
 
 
 def _is_same_fit(fitted: Path, work: Path) -> bool:
-    """Compare the calibration with the fit of this machine; print the largest difference."""
+    """Return whether the calibration equals this machine's fit; print the largest difference."""
     if not fitted.is_file():
         return False  # the step that failed has reported it
     here = work / "here.json"
@@ -182,7 +183,7 @@ def _prepare(work: Path, architecture: str, suite: str, recording: Path | None) 
 
 
 def install(requirements: list[str], architecture: str, suite: str, target: Path) -> None:
-    """Install wheels for an architecture and the Python of a release of Debian into a folder."""
+    """Install wheels into a folder, for an architecture and the Python of a Debian release."""
     names = (*PLATFORMS[architecture], f"{GLIBC}_{MACHINES[architecture]}")
     platforms = (word for name in names for word in ("--platform", name))
     run(
@@ -197,7 +198,7 @@ def install(requirements: list[str], architecture: str, suite: str, target: Path
 
 
 def _libraries(architecture: str, suite: str) -> list[str]:
-    """Return the requirements of the tests on a processor; pip evaluates markers for this one."""
+    """Return the test requirements for an architecture; pip would use this machine's markers."""
     project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text(encoding="utf-8"))
     machine = {"platform_machine": MACHINES[architecture], "python_version": PYTHONS[suite]}
     needed = map(Requirement, project["dependency-groups"]["test"])

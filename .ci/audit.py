@@ -40,7 +40,7 @@ def main() -> int:
         for item in found
         for hole in item.get("vulns", [])
     ]
-    print(*known, f"{len(found)} distributions, {len(known)} known holes", sep="\n")
+    print(*known, f"{len(found)} distributions, {len(known)} known vulnerabilities", sep="\n")
     return 1 if known else 0
 
 

@@ -47,7 +47,7 @@ def faults(package: Path) -> Iterator[str]:
             name = path.relative_to(tree).as_posix()
             if not name.startswith("DEBIAN/"):
                 yield from faults_of(name, path.read_bytes(), machine, sums.pop(name, ""))
-        yield from (f"{name}: has a checksum and is not there" for name in sums)
+        yield from (f"{name}: in md5sums, but not in the package" for name in sums)
 
 
 def faults_of(name: str, content: bytes, machine: int, md5: str) -> Iterator[str]:
@@ -55,7 +55,7 @@ def faults_of(name: str, content: bytes, machine: int, md5: str) -> Iterator[str
     if hashlib.md5(content).hexdigest() != md5:  # noqa: S324 - dpkg's format
         yield f"{name}: checksum differs from md5sums"
     if content[:4] == b"\x7fELF" and int.from_bytes(content[18:20], "little") != machine:
-        yield f"{name}: for another machine"
+        yield f"{name}: built for another architecture"
     if str(ROOT).encode() in content or b"/tmp/jointfitd-deb-" in content:
         yield f"{name}: names a folder of the machine that built it"
 

@@ -1,4 +1,7 @@
-"""Check that systemd can read the units and drop-ins, and that the exposure is at most 1.2."""
+"""Check that systemd can read units and drop-ins, and that no unit has an exposure level above 1.2.
+
+The exposure level is the result of `systemd-analyze security`.
+"""
 
 import shutil
 import subprocess
@@ -11,7 +14,8 @@ UNITS = sorted(SYSTEMD.glob("jointfitd*.service"))
 DROP_INS = sorted(SYSTEMD.glob("jointfitd*.conf"))
 THRESHOLD = "12"  # tenths, as in systemd-analyze
 ELSEWHERE = "/usr/bin/jointfitd"
-"""Program in ExecStart. It is not installed on a machine that only checks the unit."""
+"""Program in ExecStart. Messages that name it are ignored, because the machine that checks the
+unit may lack it."""
 
 
 def analyze(unit: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -25,7 +29,7 @@ def analyze(unit: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def complaints(unit: Path) -> list[str]:
-    """Return the defects of a unit."""
+    """Return the defects of a unit; print its exposure level."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(shutil.copy(unit, folder))
         drop_ins = Path(f"{copy}.d")
@@ -36,7 +40,7 @@ def complaints(unit: Path) -> list[str]:
     wrong = [line for line in lines if "jointfitd" in line and ELSEWHERE not in line]
     security = analyze(unit, "security", "--offline=yes", f"--threshold={THRESHOLD}", "--no-pager")
     print(*security.stdout.splitlines()[-1:], security.stderr.strip())
-    return wrong + ([f"{unit.name}: too much exposed"] if security.returncode else [])
+    return wrong + ([f"{unit.name}: exposure level too high"] if security.returncode else [])
 
 
 def main() -> int:

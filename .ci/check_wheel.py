@@ -41,7 +41,7 @@ def run(*words: str | Path, cwd: Path, **environment: str) -> str:
         env=os.environ | environment,
     )  # fmt: skip
     if done.returncode:
-        sys.exit(f"{done.stdout}{done.stderr}ended with {done.returncode}")
+        sys.exit(f"{done.stdout}{done.stderr}{words[0]} ended with {done.returncode}")
     return done.stdout
 
 
@@ -95,7 +95,7 @@ def install_by_pipx(archive: Path, work: Path) -> None:
 
 
 def main() -> None:
-    """Build, check, install and run; exit with the output of the first step that fails."""
+    """Build, check, install and run the archives; exit with the output of the first failed step."""
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         build(work / "first")

@@ -6,10 +6,11 @@ Kernels of OpenBLAS and loops of numpy round differently on each processor. If a
 the last bits, a test passes in one of these runs and fails in another.
 
 A run has the kernels (``OPENBLAS_CORETYPE``) and the loops (``NPY_DISABLE_CPU_FEATURES``) of one
-processor. The newest processor is omitted if `make test` runs on it in any case. A processor whose
-instructions this machine cannot execute is skipped with its reason. After a failure, or with
-``--all``, more runs follow. Two of them combine the oldest with the newest, which separates kernels
-from loops as the cause.
+processor. The newest processor that this machine can imitate is omitted: `make test` covers it. A
+processor whose instructions this machine cannot execute is skipped with its reason. After a
+failure, or with ``--all``, more runs follow. Two of them combine the kernels of the oldest
+processor with the loops of the newest, or the reverse. They show whether kernels or loops cause a
+failure.
 
 The exit status is 0 if every run passed, and 1 otherwise.
 """
@@ -74,9 +75,9 @@ def main(arguments: list[str]) -> int:
     failed = 0
     for processor in PROCESSORS:
         if processor.flag not in flags:
-            print(f"{processor.core_type}: skipped, this one lacks {processor.flag}", flush=True)
+            print(f"{processor.core_type}: skipped, {processor.flag} is missing", flush=True)
         elif processor.steps is None and not wants_all:
-            print(f"{processor.core_type}: this one, on which `make test` runs", flush=True)
+            print(f"{processor.core_type}: omitted, `make test` runs on this processor", flush=True)
         else:
             failed += not _passes(processor, tests)
 

@@ -23,7 +23,7 @@ from pathlib import Path
 from debian_root import CACHE, RootBuildError, bootstrap, enter, kept
 
 SUITES = ("trixie",)
-"""Releases other than that of the virtual machine with the service."""
+"""Releases of Debian. ``full_vm.py`` tests the package on the release bookworm."""
 SET_UP = """\
 set -eu
 root={work}/root
@@ -69,7 +69,7 @@ def main() -> int:
 
 
 def with_package(package: Path, suite: str, script: str) -> int:
-    """Install a package in a new system, run a shell script after `SET_UP`; return its status."""
+    """Run `SET_UP` and a shell script in a new system with a package; return the exit status."""
     if not package.is_file():
         raise RootBuildError(f"{package}: no such package: make deb")
     architecture = field(package, "Architecture")

@@ -1,8 +1,8 @@
 """Debian root file systems, which mmdebstrap makes once a week for virtual machines and tests.
 
 Invariant: a root contains only Debian and no part of the project, so it is valid for every commit.
-Its name is a digest of its packages, its scripts and the week. In a new week, it contains Debian's
-security updates.
+Its file name contains a digest of its recipe and of the week. In a new week, a new root is made,
+with Debian's security updates.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SUITE = "bookworm"
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jointfitd"
 SEARCH = os.environ.get("PATH", "") + ":/usr/sbin:/sbin"
 NAMESPACES = ("--mount", "--propagation=private", "--pid", "--fork", "--kill-child")
-"""Options of unshare. No mount and no process outlives the command."""
+"""Options of unshare with which no mount and no process outlives the command."""
 _KEPT_DAYS = 21
 
 
@@ -95,11 +95,11 @@ def bootstrap(
     suite: str = SUITE,
     architecture: str | None = None,
 ) -> Path:
-    """Make ``rootfs.tar`` in `work` from minbase and `packages`, without manual pages.
+    """Make ``rootfs.tar`` in `work` from minbase and `packages`, and return its path.
 
     The default of `architecture` is that of this machine. QEMU emulates any other.
     """
-    # An old mirror of unstable hides no security updates, because unstable has none.
+    # Unstable has no security updates that an outdated mirror could hide.
     options = ["--aptopt=Acquire::Check-Valid-Until no"] if suite == "sid" else []
     if architecture is not None:
         options.append(f"--architectures={architecture}")
@@ -113,7 +113,7 @@ def bootstrap(
 
 
 def become_root() -> list[str]:
-    """Return the words before a command that needs root."""
+    """Return the words to put before a command that needs root."""
     return [] if os.geteuid() == 0 else ["sudo", "-n"]
 
 
@@ -129,7 +129,7 @@ def enter(script: str, work: Path, namespaces: Sequence[str] = NAMESPACES) -> in
 
 
 def run(words: list[str], work: Path) -> None:
-    """Run a command in `work`; if it fails, raise `RootBuildError` with the end of its errors."""
+    """Run a command in `work`; if it fails, raise `RootBuildError` with the end of its stderr."""
     done = subprocess.run(  # noqa: S603 - fixed commands
         words, cwd=work, env=os.environ | {"PATH": SEARCH}, text=True, capture_output=True,
         check=False, stdin=subprocess.DEVNULL,

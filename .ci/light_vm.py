@@ -40,7 +40,7 @@ HIDDEN = ("/tmp", "/run", "/var/tmp", "/mnt")
 
 PREPARE = """\
 #!/bin/sh
-# PID 1 of the guest. It must power off by itself: a PID 1 that returns is a kernel panic.
+# PID 1 of the guest. It must power off by itself: if it returned, the kernel would panic.
 export PATH=/usr/sbin:/usr/bin:/sbin:/bin HOME=/tmp LANG=C.UTF-8 CI=1
 export PYTHONDONTWRITEBYTECODE=1 PYTHONUNBUFFERED=1 HYPOTHESIS_STORAGE_DIRECTORY=/tmp/hypothesis
 export {environment}
@@ -97,7 +97,7 @@ def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--time-limit", type=float, default=180.0, help="seconds, whole run")
     parser.add_argument("--memory", default="512M", help="memory of the guest")
-    parser.add_argument("--out", help="folder for junit.xml (default: thrown away)")
+    parser.add_argument("--out", help="folder for junit.xml (default: not kept)")
     parser.add_argument("--guest-modules", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("tests", nargs="*", help="pytest arguments (default: -m vm tests/vm)")
     return parser.parse_args()
@@ -115,7 +115,7 @@ def mounts(out: Path) -> list[str]:
         if any(path.is_relative_to(folder) for folder in HIDDEN):
             quoted = shlex.quote(str(path))
             lines.append(f"mkdir -p {quoted} && mount -r -t hostfs none {quoted} -o {quoted}")
-            say(f"mounting {path} back, read-only")
+            say(f"mounting {path} in the guest, read-only")
     lines.append("mkdir -p /mnt/out")
     lines.append(f"mount -t hostfs none /mnt/out -o {shlex.quote(str(out))}")
     return lines

@@ -1,8 +1,8 @@
 """Print the installed distributions as constraints: the exact versions for CI and `make`.
 
-A constraint does not install a package, so a line for an unneeded package has no effect. Every line
-must support every Python version of the project. For example, Debian 12 has Python 3.11.2, and a
-release that requires 3.11.5 cannot be installed there.
+A constraint does not install a package, so a line for an unneeded package has no effect. Every
+listed release must support every Python version of the project. For example, Debian 12 has Python
+3.11.2, and a release that requires 3.11.5 cannot be installed there.
 """
 
 import sys
@@ -22,7 +22,7 @@ def name_of(dist: Distribution) -> str:
 
 
 def main() -> None:
-    """Print one sorted line per distribution; exit with 1 if one is too new for our Python."""
+    """Print one sorted line per distribution; exit with 1 if one rejects our oldest Python."""
     project = tomllib.loads(PROJECT.read_text(encoding="utf-8"))["project"]
     oldest = project["requires-python"].removeprefix(">=") + ".0"
     locked = sorted((dist for dist in distributions() if name_of(dist) not in SKIP), key=name_of)

@@ -3,11 +3,12 @@
     .ci/machine_instructions.py CALIBRATION
 
 Debian's Python of each architecture runs ``bench.rigs.core_frames`` with the pure wheel of this
-checkout and the libraries of requirements.lock. The difference of a long and a short run does not
-contain the start. `CALIBRATION` is a file with a calibration of the simulated subject.
+checkout and the libraries of requirements.lock. The count is the difference between a long and a
+short run, so it does not contain the start of Python. `CALIBRATION` is a file with a calibration of
+the simulated subject.
 
-The result on standard output is JSON: instructions of a frame, by architecture. The exit status is
-2 if a tool or a system is missing.
+The result on standard output is JSON: the mean number of instructions per frame, by architecture.
+The exit status is 2 if a tool or a system is missing.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ TOOLS = {
     "qemu-aarch64-static": "qemu-user-static binfmt-support",
     "arch-test": "arch-test",
 }
-"""Programs, each with its Debian package. The second QEMU is for Debian's installation."""
+"""Programs, each with its Debian package. mmdebstrap needs `qemu-aarch64-static`."""
 SHORT, LONG = 300, 1300
 """Number of frames of the two runs."""
 
@@ -47,14 +48,14 @@ def interpreter_root(architecture: str) -> Path:
 
 
 def build_wheel(work: Path) -> Path:
-    """Return the pure wheel of this checkout."""
+    """Build the pure wheel of this checkout; return its path."""
     run([sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(work)], CHECKOUT)
     (wheel,) = work.glob("*.whl")
     return wheel
 
 
 def build_plugin(work: Path) -> Path:
-    """Return the compiled plugin."""
+    """Compile the plugin of QEMU that counts instructions; return its path."""
     plugin = work / "count_instructions.so"
     source = CHECKOUT / ".ci" / "count_instructions.c"
     run(["cc", "-O2", "-shared", "-fPIC", "-o", str(plugin), str(source)], work)
@@ -62,7 +63,7 @@ def build_plugin(work: Path) -> Path:
 
 
 def count(machine: str, root: Path, path: str, plugin: Path, words: list[str]) -> int:
-    """Return the number of instructions of Python with `words`."""
+    """Return the number of instructions that Python executes with the arguments `words`."""
     done = subprocess.run(  # noqa: S603 - fixed commands
         [
             f"qemu-{machine}", "-plugin", str(plugin), "-L", str(root),
@@ -84,7 +85,7 @@ def count(machine: str, root: Path, path: str, plugin: Path, words: list[str]) -
 
 
 def main() -> int:
-    """Print the instructions of a frame by architecture; return the exit status."""
+    """Print the instructions per frame by architecture; return the exit status."""
     calibration = str(Path(sys.argv[1]).resolve())
     found = {}
     try:

@@ -40,8 +40,8 @@ CHECKOUT = Path(__file__).resolve().parents[1]
 PACKAGES = ("python3", "python3-venv", "make", "git", "ca-certificates")
 DEMO = "make demo ARGS='--headless --seconds 20'"
 COMMAND = f"make test && {{ {DEMO} || {{ echo 'the demo failed: once more'; {DEMO}; }}; }}"
-"""Command to run. The demo runs in real time, and another guest of the machine can disturb it once,
-so it has two attempts."""
+"""Command to run. The demo runs in real time, and other load of the host can disturb it, so it has
+two attempts."""
 UPTIME_S = 60
 HOME = Path("/home/stranger")
 PIP_CONFIGURATIONS = (
@@ -68,7 +68,7 @@ mkdir -p "$root{home}"
 mv {work}/checkout "$root{home}/jointfitd"
 cp -L /etc/resolv.conf "$root/etc/resolv.conf"
 
-# Devices: what programs of a user need, and terminals that are not the host's.
+# Devices that programs of a user need, and terminals that are separate from the host's.
 mount -t proc proc "$root/proc"
 mount --rbind /sys "$root/sys"
 mount -t tmpfs -o mode=755 dev "$root/dev"
@@ -88,7 +88,7 @@ share() {{
   mount -o remount,ro,bind "$root$2"
 }}
 {shares}
-chown -R 1000:1000 "$root{home}" 2>/dev/null || true  # but what is shared is read-only
+chown -R 1000:1000 "$root{home}" 2>/dev/null || true  # fails for shared files, which are read-only
 
 inside() {{ chroot --userspec=1000:1000 --groups= "$root" env -i {environment} sh -c "$1"; }}
 echo "minimal root: Debian $(cat "$root/etc/debian_version"), minbase and" \\
@@ -130,7 +130,7 @@ def main() -> int:
 
 
 def _namespaces() -> tuple[str, ...]:
-    """Return the namespaces, and the start of the clocks if this kernel can set it."""
+    """Return the options of unshare, with the start of the clocks if this kernel can set it."""
     monotonic = UPTIME_S - int(time.clock_gettime(time.CLOCK_MONOTONIC))
     boottime = UPTIME_S - int(time.clock_gettime(time.CLOCK_BOOTTIME))
     clocks = ["--time", f"--monotonic={monotonic}", f"--boottime={boottime}"]
@@ -176,7 +176,7 @@ def _shared(texts: list[str]) -> list[Path]:
     found = set()
     for scheme, name in (match.groups() for text in texts for match in ABSOLUTE.finditer(text)):
         path = Path(name)
-        if scheme and path.parent != Path("/"):  # an index links to files in its own folder
+        if scheme and path.parent != Path("/"):  # a package index links to files in its folder
             path = path.parent
         if path.exists() and not path.samefile(os.devnull):
             found.add(path)

@@ -1,11 +1,11 @@
 """Fail when a test that CI must run was skipped: `no_skips.py [--minimal] JUNIT.xml ...`.
 
-Some tests may be skipped in that step. Tests of tests/vm may be skipped, because a later step runs
-them on a kernel with vcan and fails if one is skipped. Tests may be skipped if their requirement
-cannot be installed: recordings that are not part of the project, a network interface with
-multicast, or packages that need hardware. Parts of the conformance suite that a protocol excludes
-may be skipped. On the minimal system, tests that need a Debian package may also be skipped; on
-other systems, they must run.
+Some tests may be skipped. Tests of tests/vm may be skipped, because a later step of CI runs them on
+a kernel with vcan and fails if one is skipped. Tests may be skipped if their requirement cannot be
+installed: recordings that are not part of the project, a network interface with multicast, or
+packages that need hardware. Parts of the conformance suite that a protocol excludes may be skipped.
+On the minimal system, tests that need a Debian package may also be skipped; on other systems, they
+must run.
 """
 
 import sys
@@ -36,7 +36,7 @@ NOT_IN_MINIMAL = (
 
 
 def skipped(cases: list[ET.Element]) -> list[tuple[str, str]]:
-    """Return name and reason of each skipped test, except tests of tests/vm."""
+    """Return name and reason of each skipped test, except expected failures and tests/vm."""
     return [
         (name, found.get("message") or "no reason given")
         for case in cases

@@ -3,13 +3,13 @@
 
     .ci/power_cut.py [--cuts N] [--seed N] [--time-limit S]
 
-The light virtual machine records four sensors of 400 Hz to its own disk. At N random times, the
-machine is stopped for a short time and its disk is copied. At the last time, the machine is killed.
+The light virtual machine records four sensors at 400 Hz to its own disk. At N random times, the
+machine is paused and its disk is copied. At the last of these times, the machine is also killed.
 A copied disk contains the data that the guest had written, without the pages in its memory. A
-second machine mounts these disks, which replays their journals. It copies the recordings to the
-host.
+second machine mounts these disks, so that their journals are replayed, and copies the recordings to
+the host.
 
-Invariant: every recording opens. It lacks at most the last second, and nothing before.
+Invariant: every recording can be opened. It lacks at most the last second before the cut.
 
 The exit status is 0, or 1 if a recording lacks more. Other values are those of ``light_vm.py``.
 """
@@ -43,10 +43,11 @@ DISKS = "/dev/shm"  # noqa: S108 - memory: a busy disk of the host would delay t
 LONGEST_LOSS_S = 1.0
 """Longest accepted loss on a machine with its own processor, s."""
 STAMP_S = 0.1
-"""Time between two printed stamps, s. A longer time is caused by the load of this machine."""
+"""Time between two stamps, s. A stamp is the arrival time of a chunk, which the guest prints. A
+longer time is caused by the load of this machine."""
 FILE_S = 2.0
-"""Duration of one file, s. A file is long enough that a large loss is possible. Some cuts occur at
-the beginning of a file."""
+"""Duration of one file, s. It exceeds `LONGEST_LOSS_S`, so the loss of a file would fail the test.
+It is shorter than `RECORDED_S`, so some cuts can occur at the beginning of a file."""
 RECORDED_S = 6.0
 """Period in which the power cuts occur, s."""
 RECORD = """\
@@ -173,7 +174,7 @@ class CutDisk(NamedTuple):
 
 
 def cut_power(work: Path, memory: Path, moments_s: list[float], limit_s: float) -> list[CutDisk]:
-    """Record on a machine; return its disk at each time, or none if it does not record."""
+    """Record on a machine; return its disk at each cut, or no disks if it does not record."""
     machine = RecordingMachine(work, memory / "disk")
     try:
         if not machine.wait_for_recording(limit_s):
@@ -191,7 +192,7 @@ def cut_power(work: Path, memory: Path, moments_s: list[float], limit_s: float) 
 
 
 def hand_over(work: Path, disks: list[Path], limit_s: float) -> int:
-    """Copy the recordings to the host by means of a second machine that mounts the disks."""
+    """Mount the disks in a machine that copies the recordings to the host; return its status."""
     letters = ascii_lowercase[: len(disks)]
     light_vm.write_init(work / "init", work / "out", HAND_OVER, disks=" ".join(letters))
     attached = [f"ubd{number}={disk}" for number, disk in enumerate(disks)]
@@ -199,7 +200,7 @@ def hand_over(work: Path, disks: list[Path], limit_s: float) -> int:
 
 
 def judge(folder: Path, cut: CutDisk) -> bool:
-    """Print the time range of a recording; return whether only its last second is missing."""
+    """Print the losses of a recording; return whether at most its last second is missing."""
     recording = open_recording(folder)
     messages = list(recording.messages())
     found = [one for one in messages if isinstance(one, RecordedMessage)]

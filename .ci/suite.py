@@ -8,10 +8,12 @@ contains the number of tests in both parts, and the time in seconds.
 
 System tests start daemons in real time, and tests with the marker `real_time` simulate devices that
 send in real time. Other tests on the same cores can delay both. If such a test fails while others
-run, it is repeated once, alone. It passes only if it then passes, and the summary names it.
+run, it is repeated once, alone. It counts as passed only if the repetition passes, and the summary
+names it.
 Experiments are repeated in the same way, because those that compute run at low priority and can
-exceed a time limit; a wrong result is computed again. Tests with the marker `alone` measure times,
-which a pause of the machine disturbs, so they are repeated, too. Other tests are not repeated.
+exceed a time limit. A wrong result is wrong in both runs. Tests with the marker `alone` measure
+times, which a pause of the machine disturbs, so they are repeated, too. Other tests are not
+repeated.
 
 Invariant: the exit status is 0 only if both parts passed.
 """
@@ -41,8 +43,8 @@ workers would delay each other."""
 WORKERS = ("-p", "tests.forked_workers", "--workers")
 """Options of pytest that run the tests in workers. The number of workers follows."""
 ENVIRONMENT = {key: os.environ[key] for key in os.environ if key != "PYTHONDONTWRITEBYTECODE"}
-"""Environment of the tests. Hundreds of processes import the project, so it must be compiled only
-once."""
+"""Environment of the tests. Python writes bytecode, because hundreds of processes import the
+project."""
 REPEATED = "-repeated"
 """End of the name of the report on repeated tests."""
 TESTS_FAILED = 1
@@ -98,13 +100,13 @@ def _run(part: str, reports: Path, arguments: list[str], report: str = "") -> in
 
 
 def _files_of_tests_alone() -> list[str]:
-    """Return the test files with the marker `alone`; collecting all files takes ten seconds."""
+    """Return the test files with the marker `alone`, as collecting all files takes 10 seconds."""
     files = sorted((BUILD.parent / "tests").rglob("test_*.py"))
     return [str(path) for path in files if "mark.alone" in path.read_text(encoding="utf-8")]
 
 
 def _repeat_disturbed_tests(part: str, reports: Path, every: bool) -> list[str]:
-    """Repeat failed tests that others can delay; return their names if this cleared all failures.
+    """Repeat failed tests that others can delay; return the failed tests if all of them now pass.
 
     The tests are selected by name: `--last-failed` does not select tests whose subtests failed.
 

@@ -22,7 +22,7 @@ from typing import IO
 
 UML = "linux.uml"
 MODULES = Path("/usr/lib/uml/modules")
-VOLATILE = "/var/tmp"  # noqa: S108 - holds the memory of the guest where /dev/shm is too small
+VOLATILE = "/var/tmp"  # noqa: S108 - holds the memory of the guest if /dev/shm is too small
 PR_SET_SECCOMP, PR_SET_NO_NEW_PRIVS = 22, 38
 PR_SET_PDEATHSIG = 1
 NO_RESULT = 90
@@ -36,7 +36,7 @@ NO_AVX = {
     "OPENBLAS_CORETYPE": "Nehalem",
     "NPY_DISABLE_CPU_FEATURES": "X86_V3,X86_V4,AVX512_ICL,AVX512_SPR",
 }
-"""Environment variables for every program of a guest that saves SSE registers only (see
+"""Environment variables for every program of a guest whose kernel saves no AVX registers (see
 ``hide_xstate``)."""
 
 
@@ -174,7 +174,7 @@ NOT_OF_THIS_WIRE = ("this wire", "bytes of this wire")
 
 
 def judge(code: int, report: Path) -> int:
-    """Return pytest's exit status, or 1 if a test was skipped or is missing from the report."""
+    """Return pytest's status; 1 if a test was skipped or none ran; `NO_RESULT` without report."""
     if code == TIMED_OUT:
         return code
     if not report.is_file():

@@ -46,7 +46,7 @@ explicit_package_bases = true
 follow_imports = silent
 ignore_missing_imports = true
 
-# Libraries that no compiled module calls once per frame: analysing them takes as long as all else.
+# No compiled module calls these libraries once per frame. Analysing them would double the time.
 [mypy-scipy.*,pydantic.*,mcap.*,can.*,serial.*,aiomqtt.*,paho.*,typer.*,rich.*,websockets.*]
 follow_imports = skip
 """
@@ -62,7 +62,7 @@ extensions = mypycify(
     opt_level=level, debug_level="0", multi_file=True, group_name="jointfit",
 )
 for extension in extensions:
-    # a fused multiply-add, as of arm64, rounds once where the interpreter rounds twice
+    # a fused multiply-add, as on arm64, rounds once; the interpreter rounds twice
     extension.extra_compile_args = [*(extension.extra_compile_args or []), "-ffp-contract=off"]
     extension.extra_link_args = [*(extension.extra_link_args or []), "-s"]
 arguments = ["--quiet", "build_ext", "--inplace", "--build-temp", "objects"]
@@ -114,7 +114,7 @@ def compile_modules(out: Path, groups: dict[str, list[str]], level: str = LEVEL)
     if is_current(out, groups, level):
         return out
 
-    digest = _digest(groups, level)  # before a source changes during compilation
+    digest = _digest(groups, level)  # computed first: a source may change during compilation
     work = out.with_name(f"{out.name}.new")
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
@@ -195,8 +195,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--out", type=Path, default=OUT, metavar="DIR")
     parser.add_argument("--level", default=LEVEL, help="optimization of the C compiler, 0 to 3")
-    parser.add_argument("--groups", nargs="+", metavar="GROUP", help="of pyproject.toml")
-    parser.add_argument("--check", action="store_true", help="only whether DIR is up to date")
+    parser.add_argument("--groups", nargs="+", metavar="GROUP", help="modules (default: all)")
+    parser.add_argument("--check", action="store_true", help="exit with 0 if DIR is current")
     options = parser.parse_args()
     groups = module_list()
     chosen = {name: groups[name] for name in options.groups or groups}

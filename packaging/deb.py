@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
 """Build the Debian package: `python packaging/deb.py [--arch amd64|arm64] [--out DIR]`.
 
-Invariant: the content depends only on ``requirements.lock``, the commit, and Python and C compiler
-of this machine. The same commit yields identical bytes (SOURCE_DATE_EPOCH; the default is the time
-of the commit). Wheels are only unpacked, so a package for another architecture can also be built.
-Only a package for the architecture of this machine contains compiled modules
-(packaging/compiled.py), if a C compiler exists.
+Invariant: the content depends only on ``requirements.lock``, the commit, and the versions of Python
+and C compiler of this machine. The same commit yields identical bytes. All dates are
+SOURCE_DATE_EPOCH, by default the time of the commit. Wheels are only unpacked, so a package for
+another architecture can also be built. Only a package for the architecture of this machine contains
+compiled modules (packaging/compiled.py), if a C compiler exists.
 
 The package contains its own site-packages, for all Python versions in `PYTHONS`: the names of
 extension modules contain the Python version, and all other files are the same for all versions. Its
@@ -90,7 +90,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--arch", choices=sorted(PLATFORMS), default="amd64")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "packages", metavar="DIR")
-    parser.add_argument("--version", help="as in the control file (default: that of the project)")
+    parser.add_argument("--version", help="version of the package (default: that of the project)")
     options = parser.parse_args()
     version = options.version or f"{_project_version()}-1"
     epoch = os.environ.get("SOURCE_DATE_EPOCH") or _commit_time()
@@ -131,7 +131,7 @@ def _commit_time() -> str:
         )  # fmt: skip
         if done.returncode == 0 and done.stdout.strip():
             return done.stdout.strip()
-    return str(int((ROOT / "pyproject.toml").stat().st_mtime))  # source archive, no commit
+    return str(int((ROOT / "pyproject.toml").stat().st_mtime))  # a source archive has no commit
 
 
 def _install_python(tree: Path, scratch: Path, architecture: str, epoch: str) -> None:
@@ -139,7 +139,7 @@ def _install_python(tree: Path, scratch: Path, architecture: str, epoch: str) ->
     site = tree / HOME / "lib" / "python3" / "site-packages"
     site.mkdir(parents=True)
     is_compiled = architecture == THIS_ARCHITECTURE and compiler() is not None
-    # The version of this machine first: its metadata name the compiled modules.
+    # The version of this machine comes first, because its metadata list the compiled modules.
     for python in sorted(PYTHONS, key=PYTHON.__ne__):
         wheel = _build_wheel(scratch / f"wheel-{python}", epoch, is_compiled and python == PYTHON)
         unpacked = scratch / f"site-{python}"
@@ -161,7 +161,7 @@ def _install_python(tree: Path, scratch: Path, architecture: str, epoch: str) ->
     (tree / HOME / "pyvenv.cfg").write_text(
         "home = /usr/bin\ninclude-system-site-packages = false\n"
     )
-    # Python does not compare these files with their sources, because only the package manager
+    # Python does not compare the bytecode with the sources, because only the package manager
     # changes both. postinst compiles for other Python versions.
     mode = py_compile.PycInvalidationMode.UNCHECKED_HASH
     compileall.compile_dir(
@@ -233,7 +233,7 @@ def _drop_tests(site: Path) -> None:
 
 
 def _strip(site: Path, architecture: str, epoch: str) -> None:
-    """Remove symbols for debuggers, which are nine tenths of some wheels, as Debian does."""
+    """Remove debug symbols, as Debian does; they are nine tenths of the size of some wheels."""
     machine = {"amd64": "x86_64", "arm64": "aarch64"}[architecture]
     program = shutil.which(f"{machine}-linux-gnu-strip")
     if program is None:

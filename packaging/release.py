@@ -3,7 +3,7 @@
 
 A release is a folder with wheels, source archive, Debian packages and bill of materials
 (CycloneDX). ``SHA256SUMS`` contains the checksum of each of these files. ``SHA256SUMS.sig`` is the
-Ed25519 signature of that list. KEY.pem is a private key of OpenSSL, which only ``openssl`` reads.
+Ed25519 signature of that list. KEY.pem is a private key, which only ``openssl`` reads.
 
 Invariant: the folder exists only if it is complete and its signature was verified.
 """
@@ -89,7 +89,9 @@ def check_key(key: Path) -> None:
             f"{key} is not a file: make a key with openssl genpkey -algorithm ed25519 -out {key}"
         )
     if ALGORITHM not in _run(["openssl", "pkey", "-in", key, "-noout", "-text_pub"]).upper():
-        raise ReleaseError(f"{key} is no Ed25519 key: openssl genpkey -algorithm ed25519")
+        raise ReleaseError(
+            f"{key} is no Ed25519 key: make one with openssl genpkey -algorithm ed25519"
+        )
 
 
 def sign_release(folder: Path, key: Path) -> None:

@@ -33,7 +33,7 @@ def main() -> int:
             "--python", empty / "bin" / "python", "install", "--quiet",
             "--constraint", ROOT / "requirements.lock", f"{ROOT}[{EXTRAS}]",
         )  # fmt: skip
-        # The Debian package does not contain these.
+        # The Debian package does not contain these libraries.
         _run(
             sys.executable, "-m", "pip", "--disable-pip-version-check",
             "--python", empty / "bin" / "python", "uninstall", "--quiet", "--yes", *FROM_DEBIAN,

@@ -1,1 +1,1 @@
-"""Virtual hardware: moves a limb of known geometry, and sends real bytes of its devices."""
+"""Virtual hardware: simulated sensors and cameras measure a known limb and send bytes."""

@@ -60,13 +60,14 @@ if TYPE_CHECKING:
 USAGE = 2
 """Exit code for invalid options, files or ports."""
 ORIGIN_NS = 100_000_000
-"""Unit of the start time, ns. The samples of perfect clocks then coincide with the ground truth."""
+"""The start time is a multiple of this time, ns, so that the samples of perfect clocks coincide
+with the ground truth."""
 _HIDDEN_S = 0.6
 """Time in which the cameras do not see the markers while the sensors are put on the plate, s. A new
 motion begins at most 0.3 s after its command."""
 _COMMAND_BYTES = 4096
 """Maximum length of a command line, bytes."""
-_PERFECT = "all imperfections zero, except clock offsets, minimum latencies, and those in --set"
+_PERFECT = "no imperfections except clock offsets, minimum latencies, and the knobs set by --set"
 """Help text of ``--perfect``."""
 COMMANDS = """commands, one per line on standard input:
   play NAME, play NAME at-once  change to another motion, with or without a blend
@@ -93,7 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     )
 
     commands = parser.add_subparsers(dest="command", required=True)
-    commands.add_parser("knobs", help="list every knob with its default")
+    commands.add_parser("knobs", help="list every knob (setting) with its default")
     motions = commands.add_parser("motions", help="list every motion of a limb")
     motions.add_argument("--limb", choices=[*LIMBS], default="leg", help="default: leg")
 
@@ -133,7 +134,7 @@ def _add_play_options(play: argparse.ArgumentParser) -> None:
                       help="select the motion by the daemon's calibration phase: align, static, "
                       "functional (over MQTT, broker and base as in rig.toml)")  # fmt: skip
     play.add_argument("--motion", action="append", default=[], metavar="NAME=FILE",
-                      help="add a motion from joint angles: TOML, NPZ or OpenSim .mot")  # fmt: skip
+                      help="add a motion of joint angles: .toml, .npz, .mot or .sto")  # fmt: skip
     play.add_argument("--clock", action="append", default=[], metavar="ID=PPM[,UP_S]",
                       help="skew and uptime of the clock of a sensor or mocap")  # fmt: skip
     play.add_argument("--at", action="append", default=[], metavar="SECONDS=COMMAND",
@@ -146,17 +147,17 @@ def _add_play_options(play: argparse.ArgumentParser) -> None:
                       help="write leg.toml, a chain model of the subject, and name it in "
                       "rig.toml")  # fmt: skip
     play.add_argument("--planar", action="store_true",
-                      help="cameras only, with one marker on pelvis and foot and two on thigh and "
-                      "shank, rigid on the bones, and a rig.toml for planar motion")  # fmt: skip
+                      help="cameras only, with markers rigid on the bones (one each on pelvis and "
+                      "foot, two each on thigh and shank), for planar motion")  # fmt: skip
     play.add_argument("--sample-log", action="store_true",
                       help="write samples.jsonl with the true time of each sample")  # fmt: skip
     play.add_argument("--trial", type=Path, nargs="+", metavar="FILE",
                       help="replay a trial: .npz or .sto, with .trc and .json")  # fmt: skip
 
     play.add_argument("--recording", type=Path, metavar="FILE",
-                      help="send a recording of the daemon once by virtual devices, at the "
-                      "recorded intervals, and write a rig.toml for these devices; all other "
-                      "options except --mqtt-host and --mqtt-port have no effect")  # fmt: skip
+                      help="send a recording of the daemon once through virtual devices, at the "
+                      "recorded intervals, and write their rig.toml; of the other options, "
+                      "only --directory, --mqtt-host and --mqtt-port apply")  # fmt: skip
 
     for field in dataclasses.fields(RigOptions):
         play.add_argument(
@@ -170,7 +171,8 @@ def _add_play_options(play: argparse.ArgumentParser) -> None:
 def _add_hardware_options(play: argparse.ArgumentParser) -> None:
     play.add_argument("--imu", action="append", default=[], metavar="ID=DRIVER",
                       help="driver of the IMU simulated for a sensor, such as S2=xbus; by default "
-                      "xbus and xcdi in turn; xbus-mtdata is an older device of xbus")  # fmt: skip
+                      "xbus and xcdi in turn; xbus-mtdata is an older device of the driver "
+                      "xbus")  # fmt: skip
     play.add_argument("--mocap", default="natnet", metavar="DRIVER",
                       help="driver of the motion-capture server (default natnet)")  # fmt: skip
     play.add_argument("--no-mocap", action="store_true", help="no optical system")
@@ -329,7 +331,7 @@ async def _run_scene(scene: Scene, followed: RigOptions | None, limb: str) -> No
         asyncio.get_running_loop().add_signal_handler(number, scene.stop)
 
     def play(name: str) -> None:
-        if name == "plate":  # at once, hidden from the cameras: not a part of the phase
+        if name == "plate":  # the cameras must not see the transfer to the plate
             scene.command("occlude on")
             scene.command("play plate at-once")
             asyncio.get_running_loop().call_later(_HIDDEN_S, scene.command, "occlude off")

@@ -205,7 +205,7 @@ def find_installed(name: str) -> type[Driver]:
     """Return the driver of an entry point; require that the driver is installed."""
     require(
         name in driver_names(),
-        f"entry point {name!r} must be installed; there are {', '.join(driver_names())}: run "
+        f"entry point {name!r} must be installed; installed are {', '.join(driver_names())}: run "
         "`python -m pip install --editable .` in the folder of the package, and again after a "
         "change of its pyproject.toml",
     )

@@ -46,8 +46,8 @@ class LateStartContract:
 def decode_later(driver: Driver, receiver: DecodingReceiver, count: int) -> list[Any]:
     """Return the last `count` measurements from a decoder that receives only the last chunks.
 
-    Before these chunks it receives the description of the data, or, from a decoder without
-    description, the chunks before the first measurement.
+    Before these chunks it receives the description of the data. If the first decoder has no
+    description, it receives the chunks before the first measurement instead.
     """
     again, opening, begin = receiver.restarted(driver), [], 0
     for place, chunk in enumerate(receiver.chunks):

@@ -240,7 +240,7 @@ class DriverContract(LateStartContract, ABC):
         asyncio.run(scene())
 
     def test_arrival_stamps_are_those_of_the_first_byte(self, tmp_path: Path) -> None:
-        """On a busy host, the arrival of a message is computed from the bytes behind it."""
+        """On a busy host, the arrival of a message is computed from the bytes that follow it."""
 
         async def scene() -> None:
             driver, data, t_ns, _ = await self._record(tmp_path)
@@ -268,7 +268,7 @@ class DriverContract(LateStartContract, ABC):
             require(
                 max(errors_ns) <= 2 * byte_ns,
                 "the arrival of a sample must be back-dated by the bytes behind it in its chunk, "
-                f"{_BITS} bits each at {self.baud} baud; one is wrong by {max(errors_ns)} ns",
+                f"{_BITS} bits each at {self.baud} baud; one time is wrong by {max(errors_ns)} ns",
             )
 
         asyncio.run(scene())
@@ -301,7 +301,7 @@ class DriverContract(LateStartContract, ABC):
         asyncio.run(scene())
 
     def test_input_from_before_the_opening_is_discarded(self, tmp_path: Path) -> None:
-        """The driver discards bytes that the system buffered before; their time is unknown."""
+        """The driver discards older bytes in the system's buffer; their time is unknown."""
 
         async def scene() -> None:
             device, driver = self.make_device(tmp_path, clean_wire), self.make_driver(tmp_path)
@@ -415,7 +415,7 @@ class DriverContract(LateStartContract, ABC):
         asyncio.run(scene())
 
     def test_absent_device_raises_device_lost(self, tmp_path: Path) -> None:
-        """A device that is absent at the start is lost, so the supervisor tries again."""
+        """The driver reports an absent device as lost, so the supervisor tries again."""
         if not self.has_plug:
             raise SkipTest("this wire cannot be unplugged")
 

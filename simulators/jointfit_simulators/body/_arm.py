@@ -2,8 +2,8 @@
 
 The angles of the shoulder are tilt and torsion. The first two columns are the rotation vector of
 the long axis (positive forward and towards the midline). The third column is the internal rotation.
-These angles are regular for less than 180 degrees of elevation. Elbow and wrist have the angles of
-the leg: flexion forward, adduction, pronation.
+These angles have no singularity below 180 degrees of elevation. Elbow and wrist have the angles of
+the leg: flexion forward, adduction, and internal rotation, which is pronation.
 
 Invariant: a motion has two continuous derivatives.
 """
@@ -51,7 +51,8 @@ UPPER_ARM_M, FOREARM_M = 0.30, 0.26
 SHOULDER_IN_THORAX = (0.17, 0.0, -0.05)
 """Shoulder joint centre in thorax coordinates (right, anterior, up), m."""
 THORAX_AT = (0.0, 0.0, 1.45)
-"""Origin of the thorax (suprasternal height) in the base world, m."""
+"""Origin of the thorax, at the height of the suprasternal notch, in the base world (see
+`LimbKind`), m."""
 
 _CLUSTERS = {
     "thorax": ("X1", "X2", "X3", "X4"),

@@ -25,7 +25,7 @@ MISPLACED_M = 0.006
 _EXACT_PARTS = ("pelvis",)
 """Segments with exact markers."""
 _FLEXION_RAD = (-2.4, 0.1)
-"""Range of the knee hinge about the right axis, rad."""
+"""Range of the angle of the knee hinge about the axis to the right, rad."""
 Vector = tuple[float, float, float]
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 PARTS = ("pelvis", "thigh", "shank", "foot")
 
 COORDINATES = 31
-"""Number of columns of a coordinate array, which contains the posture of limb and plate."""
+"""Number of columns of a coordinate array: the posture of the limb and of the calibration plate."""
 PELVIS_POSITION = slice(0, 3)
 """Columns of the pelvis position (mid-pelvis) in the base world, m."""
 PELVIS_TURN = slice(3, 6)
@@ -120,7 +120,7 @@ def leg_pose(geometry: LegGeometry, coordinates: Array) -> LegPose:
 def included_angle(thigh: Rotation, shank: Rotation) -> Array:
     """Return the inner angle between two long axes, rad, shape (n,); pi if straight."""
     if not len(thigh):
-        return np.empty(0)  # scipy 1.10 applies no empty rotation
+        return np.empty(0)  # SciPy 1.10 cannot apply an empty rotation
     down = np.array([0.0, 0.0, -1.0])
     a, b = thigh.apply(down), shank.apply(down)
     bend = np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1))

@@ -1,7 +1,7 @@
 """Built-in motions, which are functions from time to leg coordinates.
 
-All joint angles are zero in upright stance, as in every calibration. Walking is on a treadmill, so
-the subject remains in the capture volume.
+All joint angles are zero in upright stance, which is the static pose of the calibration. Walking is
+on a treadmill, so the subject remains in the capture volume.
 
 Invariant: a motion has two continuous derivatives.
 """

@@ -77,7 +77,7 @@ class MotionScript:
         self._transition_s = transition_s
         self._layers: list[tuple[float, str]] = []
         self._at_once: set[tuple[float, str]] = set()
-        """Layers that begin without a blend."""
+        """Motions that begin without a blend."""
         for step in steps:
             self._check(step.name)
             self._layers.append((start_s, step.name))

@@ -37,7 +37,7 @@ PLATE_TEMPLATE = np.array(
 )
 """Asymmetric marker positions in the frame of the plate, m, shape (5, 3)."""
 _PLACEMENT_M = 0.008
-"""Standard deviation of each coordinate of a marker on the skin, m."""
+"""Standard deviation of the placement error of a marker on the skin, per coordinate, m."""
 
 
 def random_misalignment(random: np.random.Generator, most_rad: float) -> Rotation:

@@ -57,7 +57,7 @@ def _rms_length(vectors: Array) -> float:
 def _mixing(
     random: np.random.Generator, features: Array, vectors: int, common_share: float
 ) -> Array:
-    """Return random directions for the features of one joint, with RMS length 1 overall."""
+    """Return random directions for the features of a joint; displacements have RMS length 1."""
     kinds = features.shape[1]
     common = random.standard_normal((kinds, 1, 3))
     common /= _rms_length(np.tensordot(features, common, 1))

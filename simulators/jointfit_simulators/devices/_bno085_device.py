@@ -239,7 +239,7 @@ class Bno085Device(SerialDevice):
 
 
 def euler_deg(q: Quaternion, order: Literal["zxy", "zyx"]) -> tuple[float, float, float]:
-    """Return yaw, pitch and roll of an orientation, degrees."""
+    """Return yaw, pitch and roll of an orientation, degrees, for an order of the axes."""
     if order == "zyx":
         roll, pitch, yaw = roll_pitch_yaw_deg(q)
         return yaw, pitch, roll

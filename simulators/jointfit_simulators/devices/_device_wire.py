@@ -60,7 +60,7 @@ class SerialDevice(ABC):
         return self.sample_bytes * _BITS * 1_000_000_000 // baud if baud else 0
 
     def edge(self, device_ns: int) -> None:  # noqa: B027 - most devices have no sync input
-        """Ignore an edge, because no message reports it."""
+        """Ignore an edge on the sync input, because no message reports it."""
 
     def lose(self, count: int) -> None:
         """Lose the next `count` samples, which are numbered but not sent."""

@@ -2,8 +2,8 @@
 
 Input poses are in a world with z up. Frames have the axes of the server.
 
-Invariant: an untracked body repeats its last valid pose with bit 0 clear. An occluded labeled
-marker is omitted, or has bit 0 set and a plausible position.
+Invariant: an untracked body repeats its last valid pose, with bit 0 of its flags clear. An occluded
+labeled marker is omitted, or has bit 0 of its flags set and a plausible position.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class RigidBodyAsset:
 
 @dataclass(frozen=True, slots=True)
 class FrameStamps:
-    """Frame number and time stamps of one frame, in server ticks."""
+    """Number, times and flags of one frame. Times are server ticks, but `timestamp` is in s."""
 
     number: int
     timestamp: float

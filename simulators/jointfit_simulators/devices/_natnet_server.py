@@ -1,7 +1,8 @@
 """Simulated NatNet server of Motive on the loopback interface.
 
 Invariant: a unicast client receives the first frame after the reply to its REQUEST_MODELDEF, or 50
-ms after CONNECT. One existing client treats the next datagram as the model description.
+ms after CONNECT. The reason: one existing client treats the datagram after its request as the model
+description.
 """
 
 from __future__ import annotations

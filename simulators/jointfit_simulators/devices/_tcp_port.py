@@ -14,7 +14,7 @@ _LOOPBACK = "127.0.0.1"
 _BACKLOG = 16
 _READ = 1 << 16
 _MOST_QUEUED = 1 << 20
-"""Number of unread bytes at which frames to a client are dropped."""
+"""Number of unsent bytes at which frames to a client are dropped."""
 
 
 class TcpClient:

@@ -16,7 +16,7 @@ LOOPBACK = "127.0.0.1"
 _TRIES = 50
 _READ_BYTES = 1 << 16
 _MOST_UNSENT = 1 << 20
-"""Number of unread bytes at which a client is disconnected."""
+"""Number of unsent bytes at which a client is disconnected."""
 
 
 class VrpnPeer:

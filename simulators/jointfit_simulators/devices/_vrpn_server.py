@@ -131,7 +131,7 @@ class VrpnServer:
 
     def push(self, exposure_host_ns: int, markers: Markers, bodies: Bodies) -> None:
         """Send one frame now; see `NatNetServer.push`."""
-        # Messages are created one after another, even if their frames are sent together.
+        # Stamps increase from message to message, even if several frames are sent together.
         made_ns = max(time.monotonic_ns(), exposure_host_ns, self._made_ns)
         server_ns = self.options.device_ns(made_ns) + self._epoch_ns + self.stepped_ns
         poses: dict[str, Pose] = {name: pose for name, pose in bodies.items() if pose is not None}

@@ -120,7 +120,7 @@ class RecordedCanSource:
         return self.wire.is_open
 
     def send(self, data: bytes) -> None:
-        """Send the frames of a chunk, except the notes of the recording host."""
+        """Send the frames of a chunk, except error frames and notes of the recording host."""
         frames = [one for one in unpack_frames(data) if isinstance(one, CanFrame) and not one.error]
         self.sent += self.wire.send(frames)
 
@@ -192,7 +192,7 @@ class RecordedCameras:
         return self._client is not None
 
     def begin(self, now_ns: int) -> None:
-        """Set the host time at which the playback starts, ns. It defines the recorded clock."""
+        """Set the host time at which the playback starts, ns; the recorded clock then continues."""
         self._began_ns = now_ns
 
     def send(self, data: bytes) -> None:

@@ -40,7 +40,7 @@ def read_session_chunks(path: Path) -> RecordedSession:
     Raises
     ------
     UnplayableRecordingError
-        The file is not a recording, or damaged.
+        The file is not a recording, or is damaged.
     OSError
         The file cannot be read.
     """

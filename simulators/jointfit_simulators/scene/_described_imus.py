@@ -84,7 +84,7 @@ def text_lines(port: Path, rate_hz: float, noise: WireNoise) -> tuple[TableDevic
 
 
 def time_and_integers(bus: CanWire, first_id: int, rate_hz: float) -> tuple[TableDevice, list[str]]:
-    """Return a device that sends like an SBG Ellipse, and its keys in rig.toml."""
+    """Return a device with the CAN frames of an SBG Ellipse, and its keys in rig.toml."""
     fields = {slot: TableField(2 * slot, "i", 16, scale=1 / _COUNTS, frame=1) for slot in range(4)}
     fields[_TIME] = TableField(0, "u", 32, scale=S_PER_US)
     table = CanTable(((first_id, False), (first_id + 1, False)), fields)
@@ -99,7 +99,7 @@ def time_and_integers(bus: CanWire, first_id: int, rate_hz: float) -> tuple[Tabl
 
 
 def halves_of_floats(bus: CanWire, first_id: int, rate_hz: float) -> tuple[TableDevice, list[str]]:
-    """Return a device without time that sends two floats per frame, and its keys in rig.toml."""
+    """Return a device that sends two floats per frame and no time, and its keys in rig.toml."""
     fields = {slot: TableField(4 * (slot % 2), "f", 32, frame=slot // 2) for slot in range(4)}
     table = CanTable(((first_id, False), (first_id + 1, False)), fields)
     options = TableDeviceOptions(fields, rate_hz, world="NWU", world_to_sensor=True)

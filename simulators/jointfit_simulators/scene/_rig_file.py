@@ -13,8 +13,7 @@ if TYPE_CHECKING:
     from jointfit_simulators.body import RigChain
 
 _SHORTEST_S = 45.0
-"""Default of ``functional_min_s`` in the daemon, s. The value is limited to the duration of the
-phase."""
+"""Default of ``functional_min_s`` in the daemon, s. It is lowered to the duration of the phase."""
 
 
 @dataclass(frozen=True, slots=True)

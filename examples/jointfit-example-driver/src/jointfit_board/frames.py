@@ -29,7 +29,8 @@ class BoardFrame(NamedTuple):
     time_us: int
     counts: tuple[int, int, int, int]
     end: int = 0
-    """Number of bytes that the codec received up to the end of the frame, for back-dating."""
+    """Number of bytes that the codec received up to the end of the frame. The decoder computes
+    from it when the first byte of the frame arrived."""
     size: int = SIZE
     """Number of bytes on the wire."""
 

@@ -66,7 +66,7 @@ class BoardImu:
         """Open the port, start the board if it does not send, and read until cancelled."""
         settings = self._settings
         with SerialPort(settings.port, settings.baud) as port:
-            port.flush_input()  # the system stores some bytes of an earlier run
+            port.flush_input()  # the system may have stored bytes of an earlier run
             conversation = SerialConversation(port, emit, board_codec)
 
             # Read before writing, because the board may already be sending.

@@ -26,11 +26,11 @@ class BoardDevice:
     Parameters
     ----------
     link
-        Symbolic link to the host's port.
+        Symbolic link to the port that the host opens.
     streaming
         Whether the board already sends.
     wire_noise
-        Noise applied to each frame to the host.
+        Function that disturbs the bytes of each frame to the host.
     """
 
     rate_hz = 100.0
