@@ -1,9 +1,9 @@
 """Robust fusion of several estimates of one center.
 
-Each estimate is weighted by its information matrix. If the estimate from one marker is uncertain in
-a direction, other markers therefore determine the center in this direction. The weight of an
-estimate is reduced if it differs from the others by more than its covariance allows. A flag then
-names the estimate.
+Each estimate is weighted by its information matrix. In a direction in which one estimate is
+uncertain, the other estimates therefore determine the center. The weight of an estimate is reduced
+if it differs from the others by more than its covariance allows. If the weight of estimate k is
+below 0.5, the result has the flag ``marker_off:k``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 TOLERATED = 2.5
 """Threshold κ of the Huber weight. The weight of an estimate is reduced if its Mahalanobis
-distance, divided by the root of the dimension, exceeds the threshold.
+distance, divided by the square root of the dimension, exceeds the threshold.
 """
 _PASSES = 50
 
@@ -36,9 +36,9 @@ def fuse_centers(estimates: Sequence[CenterEstimate], *, robust: bool = True) ->
 
     where :math:`C_k` is the covariance of estimate k and w_k = min(1, κ/D_k)². κ is `TOLERATED`.
     D_k is the Mahalanobis distance of estimate k from the center fused from the other estimates,
-    divided by the root of the dimension. The information :math:`I_k` is zero along unobserved
-    directions. If the estimates differ by more than their covariances predict, C is increased
-    accordingly.
+    divided by the square root of the dimension. The information :math:`I_k` is zero along
+    unobserved directions. If the squared differences between the estimates are larger than their
+    covariances predict, C is multiplied by the ratio of observed to predicted squared difference.
 
     Parameters
     ----------
@@ -53,7 +53,8 @@ def fuse_centers(estimates: Sequence[CenterEstimate], *, robust: bool = True) ->
     Returns
     -------
     CenterEstimate
-        Fused estimate. Refused estimates are ignored unless all are refused.
+        Fused estimate. Refused estimates are not used. The result is refused if all estimates are
+        refused, or if they observe fewer than two directions.
 
     Raises
     ------

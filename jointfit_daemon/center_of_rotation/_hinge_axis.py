@@ -23,16 +23,16 @@ _FEWEST = 4
 def hinge_axis_sd(points: Array, axis: Array | None) -> float | None:
     r"""Return the standard deviation of a hinge's axis from the paths of markers, rad.
 
-    The axis is the common normal of the marker paths. The error of the axis equals the error of two
-    slopes β. β is the regression of the marker positions e along the axis on the positions x
-    perpendicular to the axis, both relative to their means,
+    The axis is the common normal of the marker paths. The error of the axis equals the error of the
+    two slopes β in a regression of e on x. e is the position of a marker along the axis, and x its
+    position perpendicular to the axis, both relative to the mean of the marker,
 
     .. math:: e_{tj} = x_{tj}^T \beta, \qquad
               \mathrm{Cov}(\beta) = s_e^2 \Big( \sum_{tj} x_{tj} x_{tj}^T \Big)^{-1}
               \frac{1+\rho}{1-\rho}
 
     for frame t and marker j, where :math:`s_e^2` is the residual variance and ρ the correlation of
-    e from frame to frame. Soft-tissue artefact and rotations about another axis are part of
+    e between successive frames. Soft-tissue artefact and rotations about another axis increase
     :math:`s_e`.
 
     Parameters
@@ -45,8 +45,8 @@ def hinge_axis_sd(points: Array, axis: Array | None) -> float | None:
     Returns
     -------
     float or None
-        Root of the mean variance in the two directions perpendicular to the axis; None without an
-        axis, or if the data do not determine its error.
+        Square root of the mean variance in the two directions perpendicular to the axis; None if
+        `axis` is None, or if the data do not determine the error of the axis.
     """
     seen = np.asarray(np.isfinite(points).all(axis=-1))
     if axis is None or np.count_nonzero(seen) < _FEWEST:

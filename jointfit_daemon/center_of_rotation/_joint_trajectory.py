@@ -25,7 +25,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.center_of_rotation._result import CenterEstimate
 
 _LEAST_VARIANCE_M2 = 1e-12
-"""Smallest variance of a side, m², which limits the weight of a side without noise."""
+"""Smallest variance of the joint position from one side, m². It limits the weight of a side without
+noise.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,19 +73,18 @@ def joint_trajectory(sides: Sequence[JointSide], frames: int) -> JointTrajectory
     The sum is over the segments k with a pose in frame t. :math:`c_k` is the center in segment k.
     :math:`s_k^2` is the trace of the covariance of the center. :math:`f_k^2` is the trace of the
     covariance of the segment's pose error at the center. Both centers are estimated from the same
-    movement, so their errors s are assumed to be fully correlated. The pose errors f are
-    independent. The predicted error E is
+    movement, so their errors s are assumed to be fully correlated. The pose errors f are assumed to
+    be independent. The predicted error E is
 
     .. math:: E^2 = \Big( \sum_k w_k s_k \Big)^2 + \sum_k w_k^2 f_k^2
 
     If the two sides differ by more than their errors predict, E is multiplied by the ratio of
     observed to predicted difference.
 
-    Along a direction that only one side observed, the position is computed from this side. Along a
-    direction that neither side observed, the position is computed from the side with fewer
-    unobserved directions. The other side is then shifted to agree with this side on average. For a
-    planar method this direction is the normal, and the position along the normal is the mean of the
-    segment's markers.
+    Along the directions that a side did not observe, its center is shifted within the segment, so
+    that the mean position agrees with the other side. The side with fewer unobserved directions is
+    not shifted. In a planar method, the normal of the plane counts as unobserved. The position
+    along the normal is then the mean of the segment's markers.
 
     Parameters
     ----------

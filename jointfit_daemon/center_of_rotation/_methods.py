@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 _ASK_EVERY = 50
-"""Number of frames between two estimates of a running method. Each estimate updates the outlier
+"""Number of frames between two estimates of ``running_sphere``. Each estimate updates the outlier
 weights.
 """
 
@@ -69,9 +69,9 @@ def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterE
         Input data. An array, shape (n, k, d) or (n, d), is equivalent to a `Movement` with only
         these points.
     method : str
-        A key of `METHODS`, or ``auto``. ``auto`` selects ``geometric`` in a plane. In space it
-        selects ``score`` if the poses of both bodies are known, and either the markers of both are
-        known or `points` is missing. Otherwise it selects ``sphere``.
+        A key of `METHODS`, or ``auto``. ``auto`` selects ``score`` if `points` is None. Otherwise
+        it selects ``geometric`` for points in a plane. For points in space it selects ``score`` if
+        the markers of both bodies are known (`Movement.both_markers`), and ``sphere`` if not.
 
     Returns
     -------
@@ -82,8 +82,8 @@ def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterE
     Raises
     ------
     ValueError
-        The method is unknown, or the movement lacks a required field. Unusable data do not raise an
-        error, but return a refused estimate.
+        The method is unknown, the movement lacks a required field, or its points have the wrong
+        shape. Unusable data do not raise an error; the estimate is then refused.
     """
     if not isinstance(movement, Movement):
         movement = Movement(np.asarray(movement, dtype=np.float64))
@@ -122,7 +122,7 @@ def _automatic(movement: Movement) -> str:
 
 
 def _beyond_parent(found: CenterEstimate, parent: Array | None) -> CenterEstimate:
-    """Refuse an estimate whose rotation is within the rotation noise of the parent's frame."""
+    """Return the estimate; refuse it if its rotation may be noise of the parent's frame only."""
     if parent is None or found.refused is not None or len(found.center) < 3:
         return found
     turn = sqrt(NOISE_FACTOR) * turn_noise(parent, found.noise)

@@ -23,7 +23,7 @@ PARENT_TURN_RAD = radians(0.8)
 may cause, rad.
 
 If the markers are 10 cm from their mean, noise of 1 mm rotates the fitted parent frame by half of
-this value. Such rotations cannot be distinguished from joint rotations.
+this value. Rotations below this value cannot be distinguished from joint rotations.
 """
 
 
@@ -100,5 +100,5 @@ class Movement:
 
     @property
     def least_turn(self) -> float:
-        """Return the largest apparent rotation that noise of a moving parent causes, rad."""
+        """Return the largest rotation that noise of the parent may cause, rad; 0 without parent."""
         return PARENT_TURN_RAD if self.parent is not None else 0.0

@@ -14,7 +14,11 @@ if TYPE_CHECKING:
 
 
 def lag_one_correlation(e: Array, seen: NDArray[np.bool_]) -> float:
-    """Return the lag-one correlation, 0 to 0.99, of residuals (n, k); 0 if not significant."""
+    """Return the correlation of residuals e, shape (n, k), between successive frames.
+
+    The result is between 0 and 0.99; it is 0 if the correlation is not significant. `seen` is the
+    mask of the visible markers, shape (n, k).
+    """
     both = seen[1:] & seen[:-1]
     count = int(np.count_nonzero(seen))
     power = float((e[seen] ** 2).sum()) / max(count, 1)

@@ -38,7 +38,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.center_of_rotation.planar import CircleMethod
 
 MarkerFit = Callable[[Array, Movement], "CenterEstimate"]
-"""Fit in a plane to the points of one marker, m, shape (n, 2), or of k markers, shape (n, k, 2)."""
+"""Function that estimates a center in a plane. Its arguments are points and a movement. The points,
+m, have the shape (n, 2) for one marker, or (n, k, 2) for k markers.
+"""
 
 OFF_AXIS = (
     "the marker paths are not planar, so the joint rotated about more than one axis: use sphere "
@@ -83,10 +85,11 @@ def grid(p: Array, _: Movement) -> CenterEstimate:
 
 
 def three_frames(p: Array, movement: Movement) -> CenterEstimate:
-    """Estimate the center from three frames of one marker, with the noise of all frames.
+    """Estimate the center from three frames of one marker.
 
-    The frames are the first, middle and last position on the arc. If the optical system reports a
-    residual for every position, the noise of a frame is proportional to the residual.
+    The frames are the first, middle and last position on the arc. Their noise is estimated from all
+    frames. If the optical system reports a residual for every position, the noise of a frame is
+    proportional to its residual.
     """
     whole = circle_estimate(p, limits=LIMITS)
     if whole.refused is not None:
@@ -100,7 +103,7 @@ def three_frames(p: Array, movement: Movement) -> CenterEstimate:
     chosen = [order[0], middle, order[-1]]
     noise = whole.noise * _relative_noise(movement.residuals, visible)[chosen]
     found = three_frame_estimate(seen[chosen], noise[:, None])
-    return replace(found, bound=whole.bound)  # bound of the whole movement
+    return replace(found, bound=whole.bound)  # Cramér-Rao bound of all frames
 
 
 def _relative_noise(residuals: Array | None, visible: NDArray[np.bool_]) -> Array:
@@ -114,7 +117,7 @@ def _relative_noise(residuals: Array | None, visible: NDArray[np.bool_]) -> Arra
 
 
 def geometric(points: Array, movement: Movement) -> CenterEstimate:
-    """Fit the circles of all markers at once by radial distance."""
+    """Fit circles about one center to all markers at once, with radial residuals."""
     start = movement.near if movement.near is not None and len(movement.near) == 2 else None
     return geometric_estimate(points, start=start, limits=LIMITS)
 

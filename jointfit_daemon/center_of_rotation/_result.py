@@ -33,8 +33,9 @@ class CenterEstimate:
     noise: float
     """Standard deviation of each coordinate of a point, estimated from the residuals, m."""
     residual: float
-    """RMS residual, m. For SCoRE a residual is the distance between the points of the two segments,
-    for other methods it is radial.
+    """RMS residual, m. For SCoRE and SARA a residual is the distance between the joint positions
+    computed from the two segments. For other methods it is the deviation of a marker's distance
+    from the radius.
     """
     radii: Array
     """Distance of each marker from the center, m, shape (k,)."""
@@ -46,8 +47,8 @@ class CenterEstimate:
     movement, not on the method.
     """
     conditioning: float
-    """T, the curvature of the path divided by the standard error of the curvature. A circle with T
-    below 6 is not usable.
+    """T, the radius divided by the largest standard error of the center. To first order, T is also
+    the curvature of the path divided by its standard error. A center with T below 6 is not usable.
     """
     frames: int
     effective_frames: float
@@ -66,8 +67,8 @@ class CenterEstimate:
     flags: tuple[str, ...] = ()
     """Findings about the data, e.g. ``orientation_inconsistent``."""
     within95: float | None = None
-    """Squared Mahalanobis distance eᵀC⁻¹e of the 95 % error ellipse of this method. If None, use
-    the quantile of the chi-square distribution.
+    """Squared Mahalanobis distance eᵀC⁻¹e that 95 % of the errors e of this method do not exceed; C
+    is the covariance. If None, use the quantile of the chi-square distribution.
     """
     refused: str | None = None
     """Cause and remedy if the center must not be used; None if the center is usable."""

@@ -2,7 +2,7 @@
 
 Orientation errors are assumed to be isotropic and independent between segments.
 `joint_angle_estimate` describes an exception for flexion. Only the trace of a position covariance
-is propagated, because a LimbState contains nothing else of the covariance.
+is propagated, because a LimbState contains only the standard deviation per axis.
 """
 
 from __future__ import annotations
@@ -84,9 +84,9 @@ def joint_positions(
               \mathrm{tr}\,\Sigma_j = \mathrm{tr}\,\Sigma_i + 2 L^2 \sigma_i^2 + \sigma_L^2
 
     For joints to the right or left of the origin of a segment, :math:`P_j = P_i \pm \frac{L}{2} R_i
-    e_x`; their variance contains half the length and half the standard deviation of the length. The
-    propagation is of first order, with isotropic orientation errors. Both values are None for all
-    joints distal to a segment of unknown orientation or length.
+    e_x`; their variance is computed from half the length and half the standard deviation of the
+    length. The propagation is of first order, with isotropic orientation errors. Both values are
+    None for all joints distal to a segment of unknown orientation or length.
 
     Parameters
     ----------

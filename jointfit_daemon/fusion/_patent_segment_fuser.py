@@ -1,4 +1,4 @@
-"""Orientation of one segment, computed only by the regression of the patent.
+"""Orientation of one segment, computed only by the regression of the patent CN 114533039 B.
 
 Invariant: the orientation of a frame depends only on the sensors of this frame. The orientation is
 the regression of all sensors of the segment, or None.

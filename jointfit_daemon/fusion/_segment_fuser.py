@@ -10,7 +10,7 @@ within 0.25 s:
 - If a sensor is lost, the difference between both sets in the previous frames is faded out. The
   last frame is ignored if its difference contradicts the frames before.
 
-Invariant: every degradation sets a flag. The orientation jumps only when it returns from a wrong
+Invariant: every degradation sets a flag. The orientation jumps only in the frame after a wrong
 sample.
 """
 
@@ -187,7 +187,8 @@ class SegmentFuser:
     def _with_heading_sd(self, t_ns: int, sd: float) -> float:
         """Return `sd`, increased by the heading error, which grows with time.
 
-        The heading is about one of three axes, so a third of its variance is added per axis.
+        A heading error is a rotation about one of three axes, so a third of its variance is added
+        per axis.
         """
         if self._calibrated_ns is None:
             self._calibrated_ns = t_ns

@@ -31,7 +31,7 @@ def sensor_states(
 
     where q_so is the orientation of the segment from one sensor, q_s the orientation of this
     sensor, q_W the rotation of its world, q_bias the sensor-to-segment alignment, and q_j the
-    rotation of a joint. The source is the patent, steps S3 and S7.
+    rotation of a joint. Source: patent CN 114533039 B, steps S3 and S7.
 
     Parameters
     ----------

@@ -6,7 +6,7 @@ rotation matrix A by a function f(q). This module inverts f by Gauss-Newton step
 .. math:: q \leftarrow q + G^{+}\,\log(f(q)^{-1} A), \qquad G = \partial\log / \partial q
 
 :math:`G^{+}` is the pseudo-inverse of G. The covariance of the coordinates is
-:math:`G^{+} C G^{+T}`, where C is the covariance of a step.
+:math:`G^{+} C G^{+T}`, where C is the covariance of the rotation vector in the step.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class JointCoordinates:
     segment: str
     names: tuple[str, ...]
     is_angle: tuple[bool, ...]
-    """Whether each coordinate is an angle, rad, or a translation, m."""
+    """True for each coordinate that is an angle, rad; False for a translation, m."""
     pose: Callable[[Array], tuple[Array, Array]] | None
     """Function that maps values, shape (n, k), to the rotation A_i of `ChainState`, shape (n, 3,
     3), and to the world origin of a free segment, m, shape (n, 3). None for a coupled joint, whose
@@ -123,7 +123,9 @@ class CoordinateTable:
     sd: Array
     """Standard deviations, rad and m, shape (T, K)."""
     misfit: dict[str, float]
-    """Largest rotation of each segment that its coordinates cannot describe, rad."""
+    """Largest rotation at any instant that the coordinates of a segment cannot describe, rad, by
+    segment name. Coupled joints have no entry.
+    """
 
 
 def coordinate_table(
@@ -142,12 +144,12 @@ def coordinate_table(
     state
         State of the chain at T instants.
     covariance
-        Covariance of a step, rad^2 and m^2, shape (T, nq, nq).
+        Covariance of a step of the state (`chains.apply_step`), rad^2 and m^2, shape (T, nq, nq).
     coordinates
         One entry for each segment, in the order of the model.
     known
         Mask of the values that the measurement determines, shape (T, K); all if None. Angles are
-        continuous over these values, because the others are arbitrary.
+        made continuous over these values only, because undetermined values are arbitrary.
     """
     values, sd, misfit, coupled, column = [], [], {}, 0, 0
     count = sum(len(joint.names) for joint in coordinates)
@@ -258,8 +260,8 @@ def _pseudo_inverse(G: Array) -> Array:
 def _continuous(values: Array, is_angle: tuple[bool, ...], known: NDArray[np.bool_]) -> Array:
     """Return values without jumps of 360 degrees between successive known rows.
 
-    `known` is the mask of these rows, shape (T,). The median of each angle in these rows is within
-    180 degrees. Other rows are returned unchanged.
+    `known` is the mask of these rows, shape (T,). The median of each angle in these rows is between
+    -180 and 180 degrees. Other rows are returned unchanged.
     """
     if not known.any():
         return values

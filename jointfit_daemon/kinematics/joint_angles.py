@@ -193,9 +193,9 @@ def _tilt_torsion(w: float, x: float, y: float, z: float, sign: float) -> JointR
 
     .. math:: R = \exp(v_x, v_y, 0)\, R_z(\tau), \quad \tau = 2\,\mathrm{atan2}(z, w)
 
-    The tilt :math:`|v|` equals the elevation, and the direction of v is the plane of elevation. In
-    a sagittal or frontal movement, :math:`v` is the flexion or adduction of the convention
-    ``flexion``. Only a tilt of 180 degrees is singular.
+    The tilt :math:`|v|` equals the elevation of the convention ``elevation``, and the direction of
+    v is the plane of elevation. In a sagittal or frontal movement, :math:`v` is the flexion or
+    adduction of the convention ``flexion``. Only a tilt of 180 degrees is singular.
 
     A rotation error perpendicular to the tilt is magnified by :math:`|v| / \sin|v|`.
     """

@@ -1,8 +1,8 @@
 """Record of a calibration, with all parameters that fusion evaluates and with quality figures.
 
 Invariants: ``Calibration.from_dict(c.to_dict()) == c`` to the last bit, even after a conversion to
-JSON text. The record never contains NaN or infinity. Time of creation and software version are
-arguments of the caller.
+JSON text. The record never contains NaN or infinity. The caller supplies the time of creation and
+the software version.
 
 The *static world* is the coordinate system of the static pose. With cameras, it is the optical
 world as it was during the static pose: all points on a body part are stored in the coordinates
@@ -37,8 +37,8 @@ Procedure = Literal["corrected", "patent"]
 """Steps of a calibration and of the fusion that uses it.
 
 ``patent`` uses only the published steps of the Chinese patent CN 114533039 B. It combines the
-sensors of a segment by the regression of quaternion components in the patent, without correction
-of heading drift and without exclusion of faulty sensors. ``corrected`` includes the methods of this
+sensors of a segment by the patent's regression of quaternion components, without correction of
+heading drift and without exclusion of faulty sensors. ``corrected`` includes the methods of this
 project.
 """
 

@@ -86,7 +86,7 @@ def is_left(chain: Chain, joint: int) -> bool:
 
 
 def neighbor(chain: Chain, i: int) -> tuple[str, ...]:
-    """Return the sensors of the segment distal to segment i, or of the proximal one if none exists.
+    """Return the sensors of the segment distal to segment i, or else of its proximal segment.
 
     If two segments are distal to segment i, the segment of the first branch is used.
     """

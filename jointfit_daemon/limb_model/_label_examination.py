@@ -13,15 +13,15 @@ if TYPE_CHECKING:
     from jointfit_daemon.limb_model._label_search import LabelFinding, LabelSearch
 
 _PART_NS = 20_000_000
-"""Time between two parts of an examination, ns, so that a stream at 100 Hz has at most one part per
-frame.
+"""Time since the preceding frame for which one additional part is done, ns. A stream at 100 Hz has
+one part per frame.
 """
 _MOST_PARTS = 4
 """Largest number of parts in one frame."""
 
 
 class LabelExamination:
-    """Search for exchanged labels in one frame, whose parts are done in later frames.
+    """Search for exchanged labels in one frame, done in parts when later frames arrive.
 
     Parameters
     ----------

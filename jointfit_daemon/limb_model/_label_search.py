@@ -67,7 +67,7 @@ _MOST_GAP_COST = 12.0
 _NEAR_M = 0.025
 """RMS residual below which a label is considered to be at the position of a hidden marker, m."""
 _TOLERANCE_M = 0.03
-"""Largest difference of the distance of two markers from their distance in the cluster, m."""
+"""Largest difference between the distances of two markers in the frame and in the cluster, m."""
 _MOST_COMPARED = 12
 """Largest number of markers in a cluster for which all exchanges, about 5000, are compared. The
 number of exchanges grows with the fourth power of the number of markers. In a larger cluster, each
@@ -83,7 +83,7 @@ _COMBINED_AT_ONCE = 150
 _SAMPLED = 40
 """Number of frames of a trial in which labels are searched."""
 _CONFIRMED = 0.5
-"""Fraction of the suspicious frames of a trial that an explanation must explain."""
+"""Fraction of the suspicious frames of a trial that a fault must explain."""
 
 
 class LabelFault(NamedTuple):
@@ -295,8 +295,8 @@ class LabelSearch:
             own = self._own[p].tolist()
             place_of |= {c: s for c, s in zip(columns, own, strict=True) if c not in (-1, s)}
             kept = {c for others in best for c in others}
-            # A fit without one marker always has a smaller residual. Because of the limit,
-            # soft-tissue artefact does not count as a fault.
+            # A fit without one marker always has a smaller residual. Such a marker therefore counts
+            # as displaced only if soft-tissue artefact cannot explain the residual of all markers.
             if rms[p] > DISPLACED_M:
                 elsewhere += [s for s in own if seen[s] and s not in kept]
         for label in elsewhere:
@@ -367,7 +367,7 @@ class LabelSearch:
         suspects: Sequence[int],
         label: int,
     ) -> int | None:
-        """Return the hidden marker at whose position a label is; None if there is no single one.
+        """Return the hidden marker at whose position a label is; None if not exactly one fits.
 
         Only clusters that are not suspect are searched.
         """

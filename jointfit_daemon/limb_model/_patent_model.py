@@ -1,11 +1,12 @@
-r"""Multiple linear regression of quaternion components, in two interpretations of the patent.
+r"""Multiple linear regression of quaternion components, in two interpretations of a patent.
 
 .. math:: \hat Y_k = \sum_m a_{k m} X_{m,k} + c_k, \qquad k = w, x, y, z
 
-X are the components of the sensors and Y the components of the segment. The model is a baseline.
-``patent12`` fits every component separately, with 12 parameters for two sensors. ``patent6`` uses
-the same sensor coefficients for all components, with 6 parameters. Both are valid only at the
-heading of the training movement, because of the intercept c.
+X are the components of the sensors and Y the components of the segment. The model is a baseline,
+published in the Chinese patent CN 114533039 B. ``patent12`` fits every component separately, with
+12 parameters for two sensors. ``patent6`` uses the same sensor coefficients for all components,
+with 6 parameters. Both are valid only at the heading of the training movement, because of the
+intercept c.
 """
 
 from __future__ import annotations
@@ -70,7 +71,11 @@ class PatentModel(SegmentModel):
     def predict_one(
         self, sensors: Sequence[Quaternion], q_other: Quaternion | None = None
     ) -> Prediction:
-        """Return the regression of one frame, or the flagged mean if the output is too short."""
+        """Return the regression of one frame.
+
+        If the norm of the output is below `SHORTEST`, the result is the mean of the sensors, marked
+        as extrapolating.
+        """
         sd = widen_sd(self.residual_sd, self.movements)
         inputs = [_same_side(q, self.q_sign) for q in sensors]
         said = [

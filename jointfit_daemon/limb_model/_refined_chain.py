@@ -1,4 +1,4 @@
-"""Marker positions of a chain model that a calibration refined.
+"""Refined marker positions of a chain model, which are part of a calibration.
 
 Invariant: positions are used only with the model in which they were refined. A model with other
 joints, axes or nominal positions has another fingerprint.

@@ -27,15 +27,18 @@ as a line.
 """
 
 MIN_WIDTH_SHARE = 0.08
-"""Smallest RMS width as a fraction of the length, which limits the rotation error about the line.
+"""Smallest RMS width as a fraction of the RMS length of the cluster. It limits the rotation error
+about the longest line.
 """
 
 MAX_BRIDGE = 60
-"""Largest number of successive frames with a missing marker that are interpolated."""
+"""Largest number of frames from one complete frame to the next between which `steady_fit`
+interpolates.
+"""
 
 MAX_FIT_RMS_M = 0.03
-"""RMS residual, m, above which the markers are swapped or mislabeled, because soft tissue moves
-less.
+"""RMS residual, m, above which the markers count as swapped or mislabeled. Soft-tissue artefact
+causes smaller residuals.
 """
 
 
@@ -100,8 +103,8 @@ def steady_fit(template: Array, positions: Array) -> tuple[Array, Array, Array]:
 
     Soft tissue moves every marker some millimeters, so the pose would step when a marker is hidden.
     The fit of a frame with missing markers therefore uses another template: marker positions on the
-    body that are interpolated in time between the nearest complete frames. If these are more than
-    `MAX_BRIDGE` frames apart, the pose of `rigid_fit` is used.
+    body that are interpolated in time between the nearest complete frames. If these two frames are
+    more than `MAX_BRIDGE` frames apart, the pose of `rigid_fit` is used.
     """
     q, t, rms = rigid_fit(template, positions)
     whole = visible(positions).all(axis=1)

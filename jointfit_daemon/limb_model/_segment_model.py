@@ -30,7 +30,7 @@ FEW_MOVEMENTS = 3
 """
 FEW_MOVEMENTS_FACTOR = 2.5
 """Factor of the standard deviation with fewer training movements. In measurements, errors on an
-untrained movement were 2.2 to 2.7 times larger than on trained movements.
+untrained movement were 2.2 to 2.7 times as large as on trained movements.
 """
 
 

@@ -15,8 +15,8 @@ residual :math:`\sigma_0` of the movement. Beyond the range it is
 
     \sigma^2 = \sigma_0^2 + \lVert U \phi \rVert^2 + \lVert W (\phi - \phi_0) \rVert^2 / c
 
-where :math:`U^\mathsf{T} U` is the covariance of the weights, :math:`\phi_0` the nearest posture
-within the range, for which d is computed, and c the number of components.
+where :math:`U^\mathsf{T} U` is the covariance of the weights, and c the number of components.
+:math:`\phi_0` are the polynomials limited to the range; beyond the range, :math:`d = W\phi_0`.
 """
 
 from __future__ import annotations

@@ -91,8 +91,8 @@ def chosen_center(
         reason = f"{frames} frames show both body parts, at least {MIN_FRAMES} are needed"
         return refusal(method, 3, frames, reason)
 
-    # The origin of both parts is `start`, which is near the joint. The positions of a distant
-    # origin would amplify the noise of the rotations.
+    # The origin of both parts is `start`, which is near the joint. At a distant origin, the noise
+    # of the rotations would cause large errors of the positions.
     step = max(1, -(-len(parent.t_ns) // MAX_FRAMES))
     above, below = (
         BodyPoses(part.q[::step], part.carry(start)[::step]) for part in (parent, child)

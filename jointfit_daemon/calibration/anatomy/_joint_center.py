@@ -1,8 +1,8 @@
 """Joint centers from the markers of one body part relative to its neighbor.
 
-A fit is a `CenterEstimate` with its leverage. Its `unseen` directions are the directions that the
-movement did not excite. For example, the movement of a hinge does not determine the position of the
-center along the axis.
+Every fit returns a `CenterEstimate` with `leverage`. Its `unseen` directions are the directions in
+which the movement did not determine the center. For example, the movement of a hinge does not
+determine the position of the center along the axis.
 
 The *static world* is the optical world as it was during the static pose.
 """
@@ -171,7 +171,8 @@ def joint_center(parent: ClusterTrack, child: ClusterTrack, start: Array) -> Cen
     part, in which the center is fixed. A sphere fit to these markers determines which directions
     were observed. Along these directions the center is the point that coincides in both parts. The
     sphere fit is not used for these directions, because noise in the proximal markers rotates the
-    pose of this part. The rotation moves distant markers off their spheres and biases the center.
+    pose of the proximal part. The rotation moves distant markers off their spheres and biases the
+    center.
     """
     found = fit_center(parent.to_static(child.points), start)
     if found.refused is not None:

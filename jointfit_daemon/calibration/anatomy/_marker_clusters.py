@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 
 MIN_SEEN_STATIC = 20
-"""Smallest number of frames of the static pose in which a marker is visible."""
+"""Smallest number of frames of the static pose in which a marker must be visible."""
 
 _BODY_POINTS = 0.1 / np.sqrt(3.0) * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1.0]])
 

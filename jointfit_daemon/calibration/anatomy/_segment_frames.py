@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 MIN_FLEXION_RAD = radians(8.0)
 """RMS rotation about the flexion axis below which the axis is undefined, rad."""
 MAX_AXIS_TILT = 0.7
-"""Largest cosine between flexion axis and long axis of a segment."""
+"""Largest accepted cosine of the angle between flexion axis and long axis of a segment."""
 CONFIGURED_SD_M = 0.01
 """Standard deviation of a configured length, m."""
 SKIN_SD_M = 0.005
@@ -68,7 +68,9 @@ error of the center is inversely proportional to the arc of the movement.
 
 _UP = np.array([0.0, 0.0, 1.0])
 _STANDING = rotation.IDENTITY
-"""Orientation of every segment in the static pose with static axes (q_O = 1 in the patent)."""
+"""Orientation of every segment in the static pose with static axes (q_O = 1 in the patent CN
+114533039 B).
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -471,8 +473,9 @@ def _shoulder_note(chain: Chain, flags: Sequence[str]) -> list[str]:
         else "raise the arm mainly forward and back in the functional phase"
     )
     return [
-        f"{', '.join(segments)}: the flexion axis is that of the shoulder's main movement, which"
-        f" differs from the anatomical axis if the arm was not raised straight forward; {remedy}"
+        f"{', '.join(segments)}: the flexion axis is the axis of the main movement"
+        " of the shoulder. It differs from the anatomical axis if the arm was not raised straight"
+        f" forward; {remedy}"
     ]
 
 

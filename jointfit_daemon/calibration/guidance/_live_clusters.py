@@ -36,7 +36,7 @@ class ClusterVisibility(NamedTuple):
     misfits: float
     """Fraction of the frames in which visible markers did not fit the static pose."""
     suspect: str | None
-    """Marker that was most often the most deviating marker of a misfit."""
+    """Marker that deviated most in the largest number of misfits; None without misfits."""
     absent: tuple[str, ...]
     """Markers (or the rigid body) that the stream has not contained so far."""
 

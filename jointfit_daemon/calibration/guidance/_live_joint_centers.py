@@ -1,7 +1,7 @@
 r"""Joint centers during the movement, frame by frame, with their expected errors.
 
 Two errors are reported separately. *Noise* decreases with the number of frames. It is the
-covariance of the fit, increased because residuals are correlated in time. The error from
+covariance of the fit, increased for the correlation of the residuals in time. The error from
 *soft-tissue artefact* depends on posture, so more frames do not reduce it. It decreases with a
 larger arc, as the leverage in brackets shows:
 

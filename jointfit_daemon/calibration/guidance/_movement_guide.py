@@ -234,7 +234,7 @@ def _fault(name: str, part: ClusterVisibility) -> str | None:
 def _missing_movement(one: LiveJointCenter, words: JointInstructions, target: float) -> str | None:
     """Return the movement that a joint center still needs; None if it is complete."""
     if one.frames == 0:
-        return "its markers were not visible yet: move both sides of it into view of the cameras"
+        return "no visible markers yet: turn both sides of the joint toward the cameras"
     if one.center is None or one.unseen > 1:
         return f"movement too small: {words.bend}"
     if one.unseen == 1 and not words.hinge:

@@ -40,7 +40,7 @@ STRAIGHT_RAD = math.radians(15.0)
 
 
 class _RotationRange:
-    """Range of one orientation relative to its first value, and the number of flexions."""
+    """Range of one orientation relative to a zero orientation, and the number of flexions."""
 
     def __init__(self, first: np.ndarray) -> None:
         self._first = first

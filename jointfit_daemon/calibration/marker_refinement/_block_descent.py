@@ -1,4 +1,4 @@
-r"""Block-coordinate descent, which optimizes marker positions and poses in turns.
+r"""Block-coordinate descent, which optimizes poses and marker positions alternately.
 
 The module `_objective` defines the objective F and the symbols. In each turn an inverse kinematics
 solver first computes the poses for given marker positions. With fixed poses, F is then minimized by

@@ -105,7 +105,7 @@ def marker_outcomes(
     free: NDArray[np.bool_],
     trials: Sequence[TrialOutcome],
 ) -> tuple[MarkerOutcome, ...]:
-    """Return the result of every marker."""
+    """Return the displacement and the errors of every marker, pooled over all trials."""
     old = _pool_errors([t.before for t in trials], [t.frames for t in trials])
     new = _pool_errors([t.after for t in trials], [t.frames for t in trials])
     moved = after.positions - before.positions

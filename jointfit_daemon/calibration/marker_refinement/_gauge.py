@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 _ZERO = 1e-6
-"""Limit of an eigenvalue of S divided by the number of frames T. A smaller eigenvalue is attributed
-to rounding. The unit is squared metres per squared metre. A marker that is independent of all
-others has the eigenvalue 1.
+"""Limit of an eigenvalue of S/T, where T is the number of frames; without unit. A smaller
+eigenvalue is attributed to rounding. A marker that is independent of all others has the eigenvalue
+1.
 """
 _WEAK = 0.01
 """Eigenvalue below which a displacement of 10 mm increases the error by less than 1 mm."""

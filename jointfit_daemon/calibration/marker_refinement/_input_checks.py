@@ -39,8 +39,8 @@ MOST_RMS_M = 0.08
 _FAR_M = 0.025
 """Distance from the model position above which a marker may have the label of another marker, m."""
 _SWAP_LEAST_M = 0.05
-"""Smallest root of the summed squared distances of the markers of a group from their model
-positions, m. With a smaller value the group does not count as exchanged.
+"""Limit for a group of markers, m: square root of the sum of the squared distances of the markers
+from their model positions. A group below this limit does not count as exchanged.
 """
 _SWAPPED_TRIAL = 0.5
 """Smallest fraction of frames with exchanged labels with which the whole trial is refused."""

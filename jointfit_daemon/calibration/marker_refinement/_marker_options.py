@@ -42,7 +42,7 @@ def with_weights(chain: ChainModel, weights: Mapping[str, float], option: str) -
     for name in weights:
         require_marker(chain, name, option)
     if not any(weights.get(m.name, m.weight) > 0.0 for m in chain.markers):
-        raise ValueError(f"{option} every weight is 0, expected some above 0")
+        raise ValueError(f"{option} every weight is 0, expected at least one above 0")
     markers = (replace(m, weight=weights.get(m.name, m.weight)) for m in chain.markers)
     return replace(chain, markers=tuple(markers))
 

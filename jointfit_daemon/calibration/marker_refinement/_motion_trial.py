@@ -46,8 +46,8 @@ class RefinementSettings:
 
     method: RefinementMethod = "joint"
     prior: float = 0.05
-    """Weight λ of the prior: cost of a displacement of 1 m from the nominal position relative to
-    the cost of an error of 1 m.
+    """Weight λ of the prior: cost of a displacement of 1 m from the nominal position, relative to
+    the cost of an error of 1 m in every frame.
     """
     huber_m: float | None = 0.02
     """Error above which the loss is linear instead of quadratic, m. With None the loss is quadratic

@@ -14,7 +14,7 @@ where :math:`\rho` is the Huber loss, :math:`r^2/2` up to the distance c and :ma
 beyond. The weight of the prior grows with the number of frames in which a marker is visible.
 Decimating frames therefore does not change the relative weight of the prior. Poses q are free in
 every frame, and positions p are the same in all frames. x is the excess of hinge angles over their
-limits, rad. Without this term, a program with joint limits could not track the refined markers.
+limits, rad. Without the last term, a program with joint limits could not track the refined markers.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 class RefinementProblem:
     """Data of one refinement. The class has no slots, because derived values are cached.
 
-    The chain contains names, nominal positions and joints. Measured positions are in `targets`.
+    The model contains names, nominal positions and joints. Measured positions are in `targets`.
     """
 
     model: ChainModel
@@ -55,9 +55,9 @@ class RefinementProblem:
     prior: float
     """Weight lambda of the distances from the nominal positions."""
     huber_m: float | None
-    """Error c above which the loss is linear, m; None if it is quadratic for all errors."""
+    """Error c above which the loss is linear, m; None if the loss is quadratic for all errors."""
     limit_m2: float = 0.0
-    """Weight kappa of the squared excess of hinge angles, m²/rad²; 0 if they are not limited."""
+    """Weight kappa of the squared excess of hinge angles, m²/rad²; 0 if angles are not limited."""
 
     @cached_property
     def seen(self) -> Array:

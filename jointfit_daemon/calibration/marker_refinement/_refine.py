@@ -53,8 +53,8 @@ if TYPE_CHECKING:
     """
 
 L1_CORNER_M = 0.001
-"""Distance below which the loss of the cost ``l1`` is quadratic, m. Otherwise the derivative of the
-loss would be discontinuous at zero.
+"""Distance below which the loss of the cost ``l1`` is quadratic, m. The quadratic part makes the
+derivative of the loss continuous at zero.
 """
 _FINE = 1e-9
 STOPPED = "stopped before convergence"
@@ -81,6 +81,8 @@ def refine_markers(
         Chain model with nominal marker positions, locked coordinates and marker weights.
     trials
         Training trials.
+    settings
+        Method and weights of the refinement; `RefinementSettings()` by default.
     validation
         Trials that are evaluated but not fitted.
     progress
@@ -149,7 +151,7 @@ class _RefinementTask:
     """Poses of the training frames at the nominal positions."""
     holdout: _HoldOut | None
     restarted: int
-    """Number of training frames whose poses a restart from another pose improved."""
+    """Number of training frames whose error decreased after a restart from another pose."""
 
 
 @dataclass(frozen=True, slots=True)

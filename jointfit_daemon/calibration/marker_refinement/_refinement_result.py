@@ -91,9 +91,9 @@ class Refinement:
     """Findings about the input that do not prevent the refinement."""
 
     def variance_of_trials(self, *, trained: bool) -> tuple[float, float]:
-        """Return the variance of the RMS errors of the trials before and after, m².
+        """Return the variance of the RMS errors of the trials, m²: before and after the refinement.
 
-        The result is NaN for fewer than two trials.
+        Both values are NaN for fewer than two trials.
         """
         some = [t for t in self.trials if t.trained == trained]
         return _variance([t.before.rms for t in some]), _variance([t.after.rms for t in some])

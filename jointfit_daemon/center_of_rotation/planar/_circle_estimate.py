@@ -51,8 +51,8 @@ class CircleLimits:
     """Smallest arc of the movement, rad."""
     sd: float = inf
     """Largest accepted predicted RMS error, m. If noise increases the curvature of the arc by
-    chance, the predicted error is too small. A limit near the expected error therefore selects
-    biased centers, which are outside their error ellipses.
+    chance, the center is biased and the predicted error is too small. A limit near the expected
+    error therefore selects biased centers, which are often outside their error ellipses.
     """
 
 
@@ -108,7 +108,7 @@ def publish(
     frames: int,
     limits: CircleLimits,
 ) -> CenterEstimate:
-    """Fit a circle and return its estimate, which may be refused.
+    """Fit a circle and return the estimate of its center, which may be refused.
 
     Parameters
     ----------
@@ -116,7 +116,8 @@ def publish(
         Moments of the points.
     lagged_product : callable
         Function of a center (a, b), relative to the centroid, and R². It returns the mean product
-        of the radial residuals of successive frames, m², from which their correlation is computed.
+        of the radial residuals of successive frames, m², from which the correlation of these
+        residuals is computed.
     method : str
         Name of the circle fit.
     frames : int

@@ -1,8 +1,8 @@
 """Algebraic circle fits in closed form: Kåsa, Pratt, Taubin and Hyper.
 
-The fits need no start value and no iteration over points. They process one set of points or arrays
-of sets. Hyper is the default because it has no essential bias. Source: Al-Sharadqah and Chernov
-2009.
+The fits need no start value and no iteration over points. They accept one set of points or many
+sets at once. Hyper is the default because it has no essential bias, which is the part of the bias
+that more points do not reduce. Source: Al-Sharadqah and Chernov 2009.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ def smallest_roots(m: CircleMoments[Array], method: str = "hyper") -> Array:
 def circle_from_root(
     m: CircleMoments[Number], eta: Number, method: str = "hyper"
 ) -> tuple[Number, Number, Number]:
-    r"""Return the center (a, b) relative to the centroid, m, and R², m², for a non-singular root.
+    r"""Return the center (a, b) relative to the centroid, m, and R², m², for a root η with Δ ≠ 0.
 
     .. math::
         \Delta &= \eta^2 - \eta M_z + C \\
@@ -129,8 +129,8 @@ def circle_from_root(
     The braces contain the terms of the methods ``kasa``, ``pratt``, ``taubin`` and ``hyper``.
     """
     z = m.xx + m.yy
-    # Δ = η² - ηMz + C is computed as a difference of products, because the sum cancels on short
-    # arcs
+    # Δ = η² - ηMz + C is computed as a difference of products, because the terms of the sum cancel
+    # on short arcs
     twice = 2.0 * ((m.xx - eta) * (m.yy - eta) - m.xy * m.xy)
     a = (m.xz * (m.yy - eta) - m.yz * m.xy) / twice
     b = (m.yz * (m.xx - eta) - m.xz * m.xy) / twice
@@ -151,7 +151,7 @@ def circle_of(m: CircleMoments[float], method: str = "hyper") -> tuple[float, fl
 def temper(
     a: Number, b: Number, square: Number, cov: tuple[Number, Number, Number]
 ) -> tuple[Number, Number, tuple[Number, Number, Number]]:
-    r"""Shrink a center towards the centroid by the outward bias of its uncertainty.
+    r"""Shrink a center towards the centroid, against the outward bias that its uncertainty causes.
 
     .. math:: S = (I + C/R^2)^{-1}, \qquad d' = S d, \qquad C' = S C S
 
@@ -191,7 +191,7 @@ def fit_circles(
     method : str
         ``kasa``, ``pratt``, ``taubin`` or ``hyper``.
     tempered : bool
-        Whether to shrink centers with `temper`. False returns the textbook center.
+        Whether to shrink centers with `temper`.
     correlated : bool
         Whether to increase the covariance for the correlation between successive residuals. The
         points must then be in order of time.

@@ -1,7 +1,7 @@
 """Grid search for the center with the smallest variance of distances.
 
-This is the published baseline of the planar method. The accuracy is limited by the extent of the
-grid on short arcs, and by the step of the grid on long arcs.
+This is the published method to which the other planar methods are compared. The accuracy is limited
+by the extent of the grid on short arcs, and by the step of the grid on long arcs.
 """
 
 from __future__ import annotations

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 Number = TypeVar("Number", float, Array)
 
 GATE = 6.0
-"""Smallest T of a published center, where T is the curvature divided by its standard error. If T is
-at least this value, the error is within 15 % of the Cramér-Rao bound.
+"""Smallest T of a published center; `CenterEstimate.conditioning` defines T. If T is at least this
+value, the error is within 15 % of the Cramér-Rao bound.
 """
 LOG_20 = log(20.0)
 FARTHEST_M = 1e4
@@ -34,7 +34,8 @@ ROUNDING = 1e-13
 class CircleMoments(NamedTuple, Generic[Number]):
     """Weighted moments of points about their centroid.
 
-    z is the squared distance of a point from the centroid.
+    The fields ``xx`` to ``zz`` are weighted means of products. In a product, x and y are the
+    coordinates of a point relative to the centroid, m, and z = x² + y².
     """
 
     weight: Number
@@ -45,7 +46,8 @@ class CircleMoments(NamedTuple, Generic[Number]):
     """Centroid, m."""
     y: Number
     xx: Number
-    """Weighted mean of the product that the field name states, m², m³ or m⁴."""
+    """Weighted mean of x·x, m². The names of the fields below state their products in the same way.
+    """
     xy: Number
     yy: Number
     xz: Number
@@ -63,7 +65,7 @@ class CircleStatistics(NamedTuple, Generic[Number]):
     bound: Number
     """Cramér-Rao bound of the mean square error at this noise, m²."""
     xx: Number
-    """Covariance of the center, m²."""
+    """Element of the covariance of the center, m², like ``xy`` and ``yy``."""
     xy: Number
     yy: Number
     largest: Number
@@ -106,7 +108,7 @@ def moments_of(points: ArrayLike, weights: ArrayLike | None = None) -> CircleMom
     pairs = ((x, x), (x, y), (y, y), (x, z), (y, z))
     means = [np.einsum("...n,...n,...n->...", share, u, v) for u, v in pairs]
 
-    # Mzz is computed as var z + (Mxx + Myy)², because z about its mean avoids cancellation
+    # Mzz is computed as var z + (Mxx + Myy)², because this sum does not cancel
     zz = np.einsum("...n,...n,...n->...", share, z, z) + (means[0] + means[2]) ** 2
     xx, xy, yy, xz, yz = means
     return CircleMoments(total, effective, middle[..., 0], middle[..., 1], xx, xy, yy, xz, yz, zz)
@@ -182,11 +184,11 @@ def circle_statistics(
             \tfrac52 \sqrt{\lambda_2/\lambda_1}\right) \hat\sigma^2/\lambda_1 \right)
 
     where n is the effective number of points. The noise variance is subtracted from the moments,
-    because noise widens the arc, which would count as curvature. Without the subtraction, the
-    predicted error on an arc of 20° is half the true error. The factor in round brackets accounts
-    for noise along the arc, which affects the estimate of the curvature. The constant 5 is exact
-    for a parabola with evenly spread abscissas t. Noise on t adds 5σ²/var t to the variance of t².
-    The constant 5/2, which applies to a whole circle, was found by simulation. The factor is
+    because the width that noise adds to the path would count as curvature. Without the subtraction,
+    the predicted error on an arc of 20° is half the true error. The factor in round brackets
+    accounts for noise along the arc, which affects the estimate of the curvature. The constant 5 is
+    exact for a parabola with evenly spread abscissas t. Noise on t adds 5σ²/var t to the variance
+    of t². The constant 5/2, which applies to a whole circle, was found by simulation. The factor is
     relevant for σ above R/30.
 
     Parameters

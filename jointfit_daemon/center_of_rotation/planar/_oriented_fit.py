@@ -78,15 +78,17 @@ def oriented_estimate(
             \qquad M = \left( (\sigma/\rho)^2 I + \Sigma_\theta \right)^{-1} \\
         q_t &= |x_t - c|, \quad e_t = q_t - \rho, \quad a_t = \arg(x_t - c) - \theta_t - \beta
 
-    In the first line, c is the center, ρ the radius, u the unit vector at an angle, θ the measured
-    angle of the child with error δ, and β the angle of the marker on the child. ε is marker noise
-    of variance σ². In a plain least-squares fit of the first line, δ would reduce the radius. The
-    last term of J subtracts the contribution of marker noise to aᵀMa. This contribution decreases
-    with the distance of the center, and would bias c outward.
+    The first line is the model: c is the center, ρ the radius, u the unit vector at an angle, θ the
+    measured angle of the child with error δ, and β the angle of the marker on the child. ε is
+    marker noise of variance σ², and Σ_θ the covariance of δ. J is minimized over c, ρ and β. In a
+    plain least-squares fit of the model, δ would reduce the radius. The last term of J subtracts
+    the contribution of marker noise to aᵀMa. This contribution decreases with the distance of the
+    center, and would bias c outward.
 
-    The guard limits the effect of the angles (limited translation, Efron and Morris 1971). Let Δ be
+    A guard limits the effect of the angles (limited translation, Efron and Morris 1971). Let Δ be
     the difference between the center with angles and the center of the circle fit. Let E be the
-    covariance of Δ under the error model `noise`, and s² = ΔᵀE⁻¹Δ. The result is
+    covariance of Δ under the error model `noise`, s² = ΔᵀE⁻¹Δ, and T the conditioning of the circle
+    fit. The result is
 
     .. math:: c = c_{circle} + \Delta \min(1, \lambda/s), \qquad
               \lambda = 0.7 \left( 1 + (6/T)^2/2 \right)
@@ -97,7 +99,8 @@ def oriented_estimate(
     Parameters
     ----------
     points : array_like, shape (n, 2)
-        Marker in the parent's coordinates, m; NaN where missing. More than 300 frames are averaged.
+        Marker in the parent's coordinates, m; NaN where missing. A longer path is averaged in
+        groups of successive frames, to 300 positions.
     angles : array_like, shape (n,)
         Angle of the child about the joint's axis relative to the parent, rad; NaN if unknown. The
         zero of the angle is arbitrary.
@@ -132,9 +135,9 @@ def oriented_estimate(
         return replace(alone, method=METHOD)
     sigma = max(_path_noise(x), _LEAST_NOISE_M)
 
-    # The covariance of the scale error uses angles that are predicted from the path, to second
-    # order. Measured angles contain noise that is correlated with the residuals and would bias the
-    # center.
+    # The covariance of the scale error uses angles that a quadratic function predicts from the
+    # positions. Measured angles contain noise that is correlated with the residuals and would bias
+    # the center.
     d = (x - x.mean(axis=0)) / max(float(x.std()), 1e-9)
     one, u, v = np.ones(len(x)), d[:, 0], d[:, 1]
     terms = np.column_stack((one, u, v, u * u, u * v, v * v))
@@ -165,7 +168,7 @@ def oriented_estimate(
 
 
 def limit_center(center: Array, C: Array, circle: Circles) -> tuple[Array, Array, float]:
-    """Limit the distance of a center with angles from the circle fit of the path alone.
+    """Limit the distance between a center estimated with angles and the circle fit of the path.
 
     Parameters
     ----------
@@ -179,13 +182,15 @@ def limit_center(center: Array, C: Array, circle: Circles) -> tuple[Array, Array
     Returns
     -------
     center, covariance, s2 : ndarray, ndarray, float
-        Limited center, its covariance, and s². The covariance includes a term for a remaining
-        inconsistency of path and angles.
+        Limited center, m, its covariance, m², and s², the squared Mahalanobis distance between the
+        two centers. The covariance includes a term for a remaining inconsistency of path and
+        angles.
     """
     if not bool(circle.valid):
         return center, C, 0.0
     spread, axes = np.linalg.eigh(circle.covariance)
-    # E may be nearly singular or negative, so a quarter of the circle's variance is the lower bound
+    # E may be nearly singular or indefinite, so its variances are set to at least a quarter of the
+    # variances of the circle's center
     apart = np.einsum("ai,ab,bi->i", axes, circle.covariance - C, axes)
     apart = np.maximum(apart, 0.25 * np.maximum(spread, 1e-18))
     delta = center - circle.center
@@ -200,7 +205,10 @@ def limit_center(center: Array, C: Array, circle: Circles) -> tuple[Array, Array
 
 
 def _thin(points: ArrayLike, angles: ArrayLike, interval: float) -> tuple[Array, Array, Array]:
-    """Return the frames with marker and angle; more than `MAX_FRAMES` are averaged in groups."""
+    """Return positions, angles and times of the frames with marker and angle.
+
+    More than `MAX_FRAMES` frames are averaged in groups of successive frames.
+    """
     x = np.asarray(points, dtype=np.float64).reshape(-1, 2)
     theta = np.asarray(angles, dtype=np.float64).ravel()
     seen = seen_places(x) & np.isfinite(theta)
@@ -220,7 +228,7 @@ def _path_noise(x: Array) -> float:
     circle = fit_circles(x)
     if bool(circle.valid):
         return float(circle.noise)
-    # The arc is nearly straight. The noise is the distance of the points from a flat parabola.
+    # The arc is nearly straight. The noise is the RMS distance of the points from a parabola.
     d = x - x.mean(axis=0)
     along, across = (d @ np.linalg.svd(d, full_matrices=False)[2].T).T
     terms = np.column_stack((np.ones(len(x)), along, along**2))
@@ -282,7 +290,7 @@ def _normal(
     H = Je.T @ Je / sigma**2 + Ja.T @ MJ
     g = Je.T @ e / sigma**2 + MJ.T @ a
 
-    # points close to the center are excluded, because the compensation diverges there
+    # points close to the center are excluded, because the last term of J diverges there
     counted = np.where(q > rho0 / 2, np.diag(M) / q**4, 0.0)
     g[:2] -= sigma**2 * counted @ d
     return H, g

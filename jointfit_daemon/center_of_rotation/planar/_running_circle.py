@@ -98,7 +98,7 @@ class RunningCircle:
     def feed(self, x: float, y: float, weight: float = 1.0) -> None:
         """Process the position of the marker in one frame, in the parent's coordinates, m.
 
-        A frame with NaN (missing marker), or without positive weight, leaves a gap in time.
+        A frame with NaN (missing marker) or without positive weight only advances the time.
         """
         if not (abs(x) < FARTHEST_M and abs(y) < FARTHEST_M and 0.0 < weight < inf):
             # Advance one frame without a measurement.
@@ -155,7 +155,10 @@ class RunningCircle:
         self._before = (x, y, w)
 
     def _slide(self, frame: Kept) -> None:
-        """Remove the oldest frame; recompute all sums every `_RESUM_FRAMES` to limit rounding."""
+        """Add a frame to the window, and remove the oldest frame if the window is full.
+
+        After every `_RESUM_FRAMES` removals all sums are recomputed, to limit rounding errors.
+        """
         kept = self._kept
         kept.append(frame)
         if self.frames <= (self._window or 0):
@@ -179,7 +182,10 @@ class RunningCircle:
             self._add(x, y, w)
 
     def _recenter(self, x: float, y: float) -> tuple[float, float]:
-        """Move the origin to a mean that is far away, because fourth powers would lose digits."""
+        """Move the origin to the mean of the frames if the mean is far away; return the new x, y.
+
+        Fourth powers of large coordinates lose digits.
+        """
         weight = self._sums[9]
         if weight <= 0.0 or self._origin is None:
             return x, y
@@ -226,7 +232,10 @@ class RunningCircle:
         )
 
     def circle(self) -> tuple[float, float, float] | None:
-        """Return center and radius, m, without `temper` and limits; None without a circle."""
+        """Return center x, y and radius, m, without `temper` and acceptance limits.
+
+        The result is None if the frames do not determine a circle.
+        """
         m = self.moments()
         z = m.xx + m.yy
         if m.effective <= 3.0 or m.xx * m.yy - m.xy * m.xy <= ROUNDING * z * z:
@@ -283,7 +292,7 @@ def _scale_sums(sums: Sums, factor: float) -> Sums:
 
 
 def _add_pair(sums: Sums, mu: float, now: Kept, before: Kept) -> Sums:
-    """Return the symmetrized sums of products of each frame with the preceding frame."""
+    """Return `sums` times `mu`, plus the symmetrized products of two successive frames."""
     x, y, w = now
     u, v, weight = before
     a, b, c, d, e, f, g, h, i, j = sums

@@ -2,8 +2,8 @@ r"""Error of a center that is computed from three frames, from the noise of each
 
 The marker is at distance r from the center, at the angles θ₁, θ₂, θ₃. Source: Akbarifar et al.
 2021, section 2-2-2. The following misprints of the source are corrected here. In equation 12, the
-denominator of the source contains a factor s, and a sum of sines instead of a difference. In
-equation 13, the terms of second order have the wrong sign. The source calls mean squares standard
+denominator contains a superfluous factor s, and a sum of sines instead of a difference. In equation
+13, the terms of second order have the wrong sign. The source calls mean squares standard
 deviations.
 """
 

@@ -1,7 +1,7 @@
 """Center of rotation from three frames, as the circle through three points in closed form.
 
-A circle through three points has no residual. The error is therefore predicted from the sides of
-the triangle. A degenerate triangle is refused.
+A circle through three points has no residual. The error is therefore predicted from the given noise
+and the sides of the triangle. A degenerate triangle is refused.
 """
 
 from __future__ import annotations
@@ -61,9 +61,10 @@ def three_frame_center(points: ArrayLike) -> Array:
 
 
 def _sides(p: Array) -> tuple[Array, Array, Array]:
-    """Return the sides from the first point, divided by the largest side, and the largest side, m.
+    """Return the vectors from the first point to the other two, divided by `size`, and `size`, m.
 
-    Without the division, squares of implausible coordinates would underflow or overflow.
+    `size` is the largest coordinate of both vectors. Without the division, squares of implausible
+    coordinates would underflow or overflow.
     """
     u, v = p[..., 1, :] - p[..., 0, :], p[..., 2, :] - p[..., 0, :]
     size = np.maximum(np.abs(u).max(axis=-1), np.abs(v).max(axis=-1))
@@ -74,7 +75,7 @@ def _sides(p: Array) -> tuple[Array, Array, Array]:
 def _offset(u: Array, v: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Return the vector from the first point to the center, and a mask of triples on a line.
 
-    The vector is divided by the largest side.
+    The vector has the scale of u and v, which `_sides` returns.
     """
     D = u[..., 0] * v[..., 1] - v[..., 0] * u[..., 1]
     s2, s3 = (u**2).sum(axis=-1), (v**2).sum(axis=-1)
@@ -121,7 +122,7 @@ def three_frame_estimate(points: ArrayLike, noise: ArrayLike) -> CenterEstimate:
     spokes = np.stack((-offset, u - offset, v - offset))
     # Radial noise e shifts the center by δ, with u·δ = r (e₂ - e₁) and v·δ = r (e₃ - e₁). Hence C =
     # r² A⁻¹ [[σ₁² + σ₂², σ₁²], [σ₁², σ₁² + σ₃²]] A⁻ᵀ with A = (u v)ᵀ and the radial variances σ².
-    # The sides u, v and the radius r are divided by the largest side; this factor cancels in C.
+    # The sides u, v and the radius r are divided by `size`; this factor cancels in C.
     moves = float(np.hypot(*offset)) * np.linalg.inv(np.stack((u, v)))
     first, second, third = (variances * spokes**2).sum(axis=1) / (spokes**2).sum(axis=1)
     chords = np.array([[first + second, first], [first, first + third]])

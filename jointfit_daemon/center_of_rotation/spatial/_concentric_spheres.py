@@ -9,7 +9,7 @@ condition
 
 gives all markers the weights of a geometric fit. n_j is the number of frames of marker j and s_j
 its relative noise variance. The term E_j, the contribution of unit noise to var F_j, removes the
-bias of short arcs. For one marker in a plane the center equals the center of the Hyper fit
+bias on short arcs. For one marker in a plane the center equals the center of the Hyper fit
 (Al-Sharadqah and Chernov 2009; Kanatani and Rangarajan 2011). For spheres the center is the limit
 of the iteration of Halvorsen 2003.
 """
@@ -141,9 +141,9 @@ def _smallest_root(paths: MarkerPaths, relative: Array) -> tuple[Array, float, A
     """Return center, η, and the radial variance and the squared radius of each marker.
 
     G is the sum that vanishes at the root η, and B the normal matrix of the center at η. Newton's
-    method on G(η) det B(η), which has no smaller root, converges from zero without overshoot.
-    Newton's method on G alone would overshoot on short arcs, because G is concave and B nearly
-    singular.
+    method is applied to G(η) det B(η), whose smallest root is η. From zero it converges without
+    overshoot. Newton's method on G alone would overshoot on short arcs, because G is concave and B
+    nearly singular.
     """
     g = np.average(paths.mean, axis=0, weights=paths.n)
     h = paths.mean - g

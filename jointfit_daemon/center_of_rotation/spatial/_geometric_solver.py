@@ -94,9 +94,9 @@ class SphereFit:
 def solve_sphere(points: Array, options: SphereOptions) -> SphereFit:
     """Fit spheres about one center by Gauss-Newton with Huber weights; radii are eliminated.
 
-    Along unobserved directions the center is equal to its start value. Otherwise noise would move
-    the center to the plane of the markers, and its covariance would be too small. Source: Halvorsen
-    2003; Chang and Pollard 2007.
+    Along unobserved directions the center is equal to its start value. Without this rule, noise
+    would move the center to the plane of the markers, and the covariance of the center would be too
+    small. Source: Halvorsen 2003; Chang and Pollard 2007.
 
     Parameters
     ----------
@@ -237,7 +237,8 @@ def evaluate_sphere(
     conditioning = radius / float(np.sqrt(np.linalg.norm(shown, 2)))
     unseen = fit.unseen
 
-    # the marker that rotated most determines the arc, because markers near the axis rotate less
+    # The marker whose direction changed most determines the arc. The directions of markers near the
+    # axis change less.
     inside = np.linalg.norm(fit.resultant @ fit.basis, axis=1)
     off = np.linalg.norm(fit.resultant @ unseen.T, axis=1) if len(unseen) else 0.0 * inside
     arc = arc_of(float((inside / np.sqrt(np.maximum(1.0 - off**2, 1e-12))).min()))

@@ -32,17 +32,18 @@ MIN_CONDITIONING = 6.0
 the center.
 """
 MIN_SIGNIFICANCE = 7.0
-"""Number of standard deviations by which the rotation in a third direction must exceed the apparent
-rotation that noise causes. Otherwise the noise of many frames would seem to determine the center
-along the axis of a hinge.
+"""Number of standard deviations by which the rotation in the third direction, which has the least
+rotation, must exceed the apparent rotation that noise causes. Without this limit, the noise of many
+frames would seem to determine the center along the axis of a hinge.
 """
 FADED = 0.5 ** LAGS[1]
-"""Largest correlation over `LAGS[1]` frames that is attributed to noise. It belongs to noise whose
-correlation halves from frame to frame. A larger correlation is attributed to soft-tissue artefact.
+"""Largest correlation over `LAGS[1]` frames that is attributed to noise. The value is the
+correlation of noise whose correlation halves from frame to frame. A larger correlation is
+attributed to soft-tissue artefact.
 """
 FILLED = 0.1
-"""Largest variance of the radial residuals of a path that is an arc, as a fraction of the variance
-of the path.
+"""Ratio of the variance of the radial residuals to the variance of the path, above which the path
+does not count as an arc.
 """
 _STILL_M = 1e-6
 _PERSISTENT = 0.99
@@ -54,10 +55,10 @@ class SphereLimits:
     """Acceptance limits of a center in space."""
 
     min_direction: float = 0.0
-    """RMS rotation of the markers in the third direction, rad, below which the joint counts as a
-    hinge even if the noise is small. With soft-tissue artefact use 3°. The value must exceed the
-    rotation of the parent's frame that noise causes, because such a rotation cannot be
-    distinguished from joint rotation.
+    """RMS rotation of the markers in the direction with the least rotation, rad, below which the
+    joint counts as a hinge even if the noise is small. With soft-tissue artefact use 3°. The value
+    must exceed the rotation of the parent's frame that noise causes, because such a rotation cannot
+    be distinguished from joint rotation.
     """
     min_arc: float = radians(8.0)
     reach: tuple[float, float] = (0.02, 1.0)
@@ -90,8 +91,9 @@ class ObservedCenter:
     basis, shape (r, s).
     """
     paths: MarkerPaths
-    """Fitted center and radii in coordinates of the basis, m."""
+    """Marker paths in coordinates of the basis."""
     found: ConcentricSpheres
+    """Fitted center and radii in coordinates of the basis."""
     spread: Array
     """Covariance of the center in coordinates of the basis, m², shape (r, r)."""
     tilt: Array
@@ -116,7 +118,8 @@ def observe(
 
     A direction is dropped if its rotation is not significantly larger than noise. Directions that
     are observable only without soft-tissue artefact remain in the fit, because the residuals would
-    be larger without them. `ObservedCenter.shown` does not contain these directions.
+    be larger without them. `ObservedCenter.shown` does not contain these directions. The result is
+    None if fewer than two directions are observable, or if the paths are not arcs.
     """
     while basis.shape[1] >= 2:
         flat = paths.seen_along(basis)
@@ -147,8 +150,8 @@ def observe(
             skin2 = found.noise2 + soft_tissue_variance(left, flat, found)
             shown = spread > MIN_CONDITIONING**2 * skin2 / radius2
 
-            # One direction alone does not determine a center. All directions are then used, and the
-            # predicted error is large.
+            # If soft-tissue artefact leaves only one observable direction, this direction does not
+            # determine a center. All directions are then used, and the predicted error is large.
             shown = shown if shown.sum() >= 2 else np.ones_like(shown)
             return _observed_center(sums, basis, flat, found, left=left, shown=axes[:, shown])
 
@@ -167,11 +170,11 @@ def soft_tissue_variance(
 
     .. math:: \mathrm{Cov}_{posture} = p^2 \left[ \overline{u u^T} - \bar u \bar u^T \right]^{-1}
 
-    where p² is the persistent variance of the residuals, and u are the unit vectors from the center
-    to the markers. The part of the artefact that is linear in u moves the center without residuals.
-    This part is assumed to be as large as the part that causes residuals. The artefact repeats with
-    every cycle, and all markers share the soft tissue of their parent. Therefore neither more
-    frames nor more markers reduce this variance.
+    where p² is the part of the residual variance that repeats with posture, and u are the unit
+    vectors from the center to the markers. The part of the artefact that is linear in u moves the
+    center without residuals. This part is assumed to be as large as the part that causes residuals.
+    The artefact repeats with every cycle of the movement, and all markers share the soft tissue of
+    their segment. Therefore neither more frames nor more markers reduce this variance.
     """
     return left.posture * found.noise2 * float((paths.n / found.relative).sum())
 
@@ -208,7 +211,7 @@ def _observed_center(
     left: ResidualStatistics,
     shown: Array,
 ) -> ObservedCenter:
-    r"""Return the covariance from the sandwich formula with the observed covariance of residuals.
+    r"""Return the center with its covariance from the sandwich formula.
 
     .. math:: \mathrm{Cov} = B^{-1} \Big[ \sum_{jl} \frac{n_{jl}\, \overline{e_j e_l}\;
               \overline{u_j u_l^T}}{s_j s_l} \Big] B^{-1} \cdot \frac{1+\rho\rho_u}{1-\rho\rho_u}

@@ -100,8 +100,8 @@ def relative(points: Array, parent: Array, center: Array) -> Array:
     Returns
     -------
     ndarray, shape (k, 3, 3)
-        Relative noise covariance of each marker, for `RunningSphere`. A marker that is never
-        visible has the common covariance.
+        Relative noise covariance of each marker, for `RunningSphere`. For a marker that is never
+        visible, the mean over all directions replaces the mean over the frames.
     """
     seen = np.asarray(np.isfinite(points).all(axis=-1), dtype=np.float64)
     S = spatial_noise(center, parent, 1.0)

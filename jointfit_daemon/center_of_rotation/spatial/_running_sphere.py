@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 OUTLIER = 3.0
 """Residual, in standard deviations, above which the weight of a marker is reduced. The threshold is
-larger than the usual 1.5. The weights of a frame are not revised later, and with a smaller
+larger than the usual 1.5, because the weights of a frame are not revised later. With a smaller
 threshold the estimated noise would decrease from frame to frame.
 """
 OFF = 8.0
@@ -79,7 +79,7 @@ class RunningSphere:
     dimension : int
         Dimension of the points: 3, or 2 in a plane.
     near : ndarray, shape (dimension,), optional
-        Position of the center along unobserved directions, m.
+        Position of the center along unobserved directions, m; the mean of the markers if None.
     robust : bool
         Whether to reduce the weight of markers that leave their sphere because of soft-tissue
         artefact or exchanged labels. The sums of a marker that remains off its sphere are then
@@ -228,7 +228,7 @@ class RunningSphere:
     def _restart(self, w: Array, off: NDArray[np.bool_]) -> Array:
         """Reset markers that remained off their sphere; return the weights without these markers.
 
-        Causes are slip and exchanged labels.
+        A marker remains off its sphere after it slipped, or after its label was exchanged.
         """
         self._off = np.where(off, self._off + 1, np.where(w > 0.0, 0, self._off))
         k, e = self._phi.shape

@@ -45,7 +45,7 @@ SEVERAL_AXES = (
     "the joint turned about more than one axis (σ₆/σ₅ {:.2f}, a hinge has less than "
     f"{HINGE_RATIO}): use score or sphere, or move about one axis only"
 )
-NO_TURN = "the child did not rotate against the parent: move the joint, at least 30° each way"
+NO_TURN = "the child did not rotate relative to the parent: move the joint, at least 30° each way"
 MIN_TURN_RAD = 0.02
 """RMS rotation about the second axis of the movement, rad, below which the movement counts as no
 rotation."""
@@ -221,7 +221,7 @@ def _covariances(
     The covariances are the covariance for white noise and the total covariance. The third value is
     the correlation of the gaps from one frame to the next, which reduces the effective number of
     frames. The fourth value is the fraction of the gap variance that repeats with posture. For this
-    fraction all frames together count as one.
+    fraction all frames together count as one observation.
     """
     gaps, w = fit.gaps, fit.weights
     n = len(gaps)

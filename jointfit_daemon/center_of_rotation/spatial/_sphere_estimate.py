@@ -37,8 +37,9 @@ if TYPE_CHECKING:
 MIN_FRAMES = 15
 """Smallest effective number of visible frames of a usable marker."""
 LOUD = 9.0
-"""Ratio of a marker's variance to the median variance above which the marker is flagged as
-noisy."""
+"""Ratio of a marker's noise variance to the median of all markers, above which the marker is
+flagged as noisy.
+"""
 PERSISTENT = 0.5
 """Lag-one autocorrelation of the residuals above which ``residuals_persist`` is set."""
 STRAIGHT = "the marker paths have no curvature: move the joint by at least 30° in each direction"
@@ -63,7 +64,7 @@ def center_of(
     Parameters
     ----------
     sums : SphereSums
-        Sums over any number of frames; the reference point of each marker is arbitrary.
+        Sums over any number of frames; the fixed point of each marker is arbitrary.
     method : str
         Method name stored in the result.
     near : ndarray, shape (d,), optional
@@ -80,7 +81,8 @@ def center_of(
         Estimate of the center, which is NaN if the data were refused before the fit. The radius is
         NaN for markers that are visible in too few frames.
     spheres : ConcentricSpheres or None
-        Fitted spheres of the markers; None unless the center is observable in all directions.
+        Fitted spheres of the markers. None if the data were refused before the fit, or if
+        soft-tissue artefact hides a direction of the fit.
     """
     limits = limits or SphereLimits()
     d = sums.origin.shape[1]

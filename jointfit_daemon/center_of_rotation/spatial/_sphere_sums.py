@@ -94,7 +94,7 @@ def sum_up(points: Array, weights: Array | None = None) -> SphereSums:
 def center_sums(sums: SphereSums) -> SphereSums:
     r"""Return the sums about the mean of each marker; markers without frames are unchanged.
 
-    If the reference point moves, φ is multiplied by a matrix T. The sums are then
+    If the fixed point of a marker changes, φ is multiplied by a matrix T. The sums are then
     :math:`M' = T M T^T` and :math:`L' = T L T^T`.
     """
     k, d = sums.origin.shape

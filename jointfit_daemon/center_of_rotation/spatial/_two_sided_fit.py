@@ -212,7 +212,7 @@ def _step(frames: _LinearGaps, basis: Array, w: Array) -> tuple[Array, Array, Ar
 
 
 def huber_weights(size: Array) -> Array:
-    """Return the weights of frames by the length of their gaps, shape (n,)."""
+    """Return the Huber weight of each frame from the length `size` of its gap, shape (n,)."""
     scale = max(float(np.median(size)) / MEDIAN_LENGTH, _LEAST_M)
     return np.asarray(np.minimum(1.0, 2.0 * HUBER * scale / np.maximum(size, 1e-300)))
 

@@ -55,10 +55,10 @@ def average_repetitions(setup: StudySetup) -> Repetition:
 
 
 def effect_of_radius(setup: StudySetup) -> Array:
-    """Return the error at each of `RADII_M`, relative to the largest radius of the setup.
+    """Return the error at each of `RADII_M` divided by the error at the largest radius of `setup`.
 
-    The result uses the 95th percentile of the error, because the mean square is not finite. The
-    noise is `LARGE_NOISE_M`, and the step is the fixed step of the setup.
+    The error is the 95th percentile, because the mean square is not finite. The noise is
+    `LARGE_NOISE_M`, and the angle between frames is `setup.step`.
     """
     rng = np.random.default_rng(setup.seed)
     drawn = rng.normal(0.0, LARGE_NOISE_M, (_RUNS, 3, 2))

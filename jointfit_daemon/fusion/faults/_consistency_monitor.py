@@ -102,7 +102,8 @@ class ConsistencyMonitor:
         Calibration with the links between sensors.
     drifting : collection of str
         Sensors without heading reference. If no hinge makes their headings observable, the standard
-        deviation grows without limit. For other sensors the drift is assumed to be bounded.
+        deviation of the heading grows without limit. For other sensors the drift is assumed to be
+        bounded.
     """
 
     def __init__(
@@ -365,7 +366,7 @@ class ConsistencyMonitor:
     def _evaluate(self, inputs: Inputs) -> ConsistencyResult:
         spread, slipped, flags = self._evaluate_pairs(inputs)
         for inner, joint in zip(self._inner, self._joints, strict=True):
-            variance = joint.extra_variance / 3.0  # heading is about one of three axes
+            variance = joint.extra_variance / 3.0  # a heading error is about one of three axes
             if variance:
                 for k in (inner.proximal, inner.distal):
                     spread[k] = sqrt(spread[k] * spread[k] + variance)

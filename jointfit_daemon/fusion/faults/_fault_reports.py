@@ -50,8 +50,8 @@ def slip_report(
 def drift_report(heading: float, proximal: str, distal: str, joint: str) -> SensorReport:
     """Return the report of a drift by `heading` rad of segment `distal` relative to `proximal`."""
     text = (
-        f"heading drifted by {degrees(heading):.0f} deg against {proximal} (estimated at {joint}, "
-        "corrected). A new static pose resets the headings"
+        f"heading drifted by {degrees(heading):.0f} deg relative to {proximal} (estimated at "
+        f"{joint}, corrected). A new static pose resets the headings"
     )
     data = {"heading_deg": round(degrees(heading), 1)}
     return SensorReport(distal, "drift", text, "info", data)
@@ -66,8 +66,8 @@ def heading_report(
         text = f"heading agrees with {proximal} again"
         return SensorReport(distal, "agrees", text, "info", data)
     text = (
-        f"heading changed by {degrees(heading):.0f} deg against {proximal}; probably a magnetic "
-        "disturbance. Joint angles are corrected, the headings of both segments are uncertain. If "
-        "it persists, repeat the static pose"
+        f"heading changed by {degrees(heading):.0f} deg relative to {proximal}; probably a "
+        "magnetic disturbance. Joint angles are corrected, the headings of both segments are "
+        "uncertain. If it persists, repeat the static pose"
     )
     return SensorReport(distal, "heading_disagrees", text, "warning", data)

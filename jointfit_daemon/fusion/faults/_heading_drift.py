@@ -8,8 +8,9 @@ which repeat with the movement and shift the measured heading as long as the mov
           \dot b = -b/\tau_b + w_2,\quad z = \delta + b + n
 
 where z is a measurement, and w_1, w_2 and n are white noise. Rate and bias are stationary
-Ornstein-Uhlenbeck processes. The bias decays with the time constant :data:`BIAS_S`, so a persistent
-offset is attributed to drift.
+Ornstein-Uhlenbeck processes with the correlation times :math:`\tau_\rho` = :data:`RATE_S` and
+:math:`\tau_b` = :data:`BIAS_S`. Because the bias decays, a persistent offset is attributed to
+drift.
 
 Invariant: without measurements the standard deviation grows. A measurement costs a few additions;
 the filter runs once per second.

@@ -41,7 +41,7 @@ CORRECTION_START = 1.6
 CORRECTION_FULL = 3.2
 """Deviation above which the correction is complete, in standard deviations."""
 NEGLIGIBLE = 0.002
-"""When a disturbance has ended, its correction is removed below this angle, rad."""
+"""Angle below which the correction of a disturbance that has ended is removed, rad."""
 MIN_SD = 0.026
 """Smallest standard deviation of a difference, rad. It is 1.5 degrees."""
 

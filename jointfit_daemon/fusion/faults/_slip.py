@@ -79,7 +79,7 @@ def pair_corrections(pairs: Sequence[SlipDetector]) -> dict[str, Quaternion]:
 
 
 class FaultDebouncer:
-    """Sets a fault after :data:`ONSET_NS` above a limit; clears it after a longer time below."""
+    """Sets a fault after `ONSET_NS` above a limit; clears it after `RELEASE_NS` well below."""
 
     def __init__(self) -> None:
         self.active = False
@@ -129,8 +129,8 @@ class SlipDetector:
         self.limit = MIN_LIMIT
         """Distance above which the pair is inconsistent, rad."""
         self.excess = 0.0
-        """Largest excess, rad, of the last difference, of its change within 0.4 s, or of the mean
-        difference over the usual value."""
+        """Largest of three excesses over the usual value, rad: excess of the last difference, of
+        its change within 0.4 s, and of the mean difference."""
         self.excess_vector: Vector = (0.0, 0.0, 0.0)
         """Excess of the last difference as the rotation vector from a to b in segment axes, rad;
         valid if `exceeded`."""

@@ -6,8 +6,8 @@ rotates by ω and translates by v, both in segment axes:
 
 .. math:: \omega = 2\,vec(\bar p\, p') / |p|^2, \qquad v = R^T s'
 
-These are the exact derivatives of the spline. Beyond the samples, p and s are extrapolated
-linearly.
+vec is the vector part of a quaternion, R the rotation matrix of p, and p' and s' are the exact
+derivatives of the splines with respect to q. Beyond the samples, p and s are extrapolated linearly.
 """
 
 from __future__ import annotations

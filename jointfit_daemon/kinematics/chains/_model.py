@@ -105,9 +105,9 @@ class ChainModel:
     Raises
     ------
     InvalidChainModelError
-        There are no segments, duplicate names, unknown parents, segments or joint kinds, parents
-        after children, a free joint with a parent, axes or rotations that do not have unit length,
-        empty limits, an invalid path, negative weights, or values that are not finite.
+        The model has duplicate names, unknown parents, segments or joint kinds, parents after
+        children, a free joint with a parent, axes or rotations that do not have unit length, empty
+        limits, an invalid path, negative weights, values that are not finite, or no segments.
     """
 
     segments: tuple[Segment, ...]

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chain_coordinates import JointCoordinates
 
 STEPS_PER_JOINT = 2
-"""Number of steps per instant for each joint. It is sufficient if the coordinates at the preceding
-instant are known.
+"""Number of steps per instant for each joint. It is sufficient for a joint whose coordinates at the
+preceding instant are known.
 """
 SPARE_STEPS = 6
 """Number of additional steps per instant, for joints that move fast or have unknown coordinates."""
@@ -39,8 +39,8 @@ _MOST_ITERATIONS = 8
 iterations are typical.
 """
 _FARTHEST_STEP = 0.8
-"""Largest step of an angle, rad. It is rarely needed, because most inversions start close to the
-solution.
+"""Largest step of an angle, rad. The limit is rarely reached, because most inversions start close
+to the solution.
 """
 _CLOSE = 1e-3
 """Distance to the pose, rad and m, below which the next step is the last. After this step the error
@@ -56,7 +56,9 @@ _SMALLEST_STEP = 1e-10
 _QUARTERS = (0.0, 0.5 * np.pi, -0.5 * np.pi, np.pi)
 """Start angles of an inversion without values of a preceding instant, rad."""
 _STEEP = 0.87
-"""Start angle of the second of three rotations, rad. It is 50 degrees."""
+"""Start angle of the second of three rotations instead of 90 degrees, where the first and the third
+rotation are about the same axis; rad.
+"""
 _MOST_ANGLES = 3
 
 
@@ -91,7 +93,7 @@ class NumericInversion:
         poses
             Rotation, shape (3, 3), and origin of a free segment, m, (3,) or (0,), of each joint.
         last
-            Values at the preceding instant, for each joint that was solved.
+            Values at the preceding instant, for each joint that was solved at that instant.
         """
         # Joints with values at the preceding instant are processed first. The other joints share
         # the remaining steps in turn.

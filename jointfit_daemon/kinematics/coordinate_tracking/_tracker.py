@@ -41,9 +41,10 @@ _Angles = tuple[_Row, tuple[_Row, _Row, _Row]]
 class CoordinateTracker:
     """Tracker of the coordinates of a chain, state by state.
 
-    The result equals the result of `coordinate_table`. The coordinates of joints with a closed form
-    are computed in closed form. For other joints a numerical search starts from the preceding
-    values. Until the search ends, the coordinates of these joints are unknown.
+    Except for full turns of angles, the result equals the result of `coordinate_table`. The
+    coordinates of joints with a closed form are computed in closed form. For other joints a
+    numerical search starts from the preceding values. Until the search ends, the coordinates of
+    these joints are unknown.
 
     Parameters
     ----------
@@ -117,7 +118,7 @@ class CoordinateTracker:
         state
             State at one instant.
         covariance
-            Covariance of a step, rad^2 and m^2, shape (nq, nq).
+            Covariance of a step of the state, rad^2 and m^2, shape (nq, nq).
 
         Returns
         -------

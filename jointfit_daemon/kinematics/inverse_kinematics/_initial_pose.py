@@ -35,7 +35,7 @@ _PULL_TO_REST = 1e-9
 def start_from_markers(
     model: ChainModel, measured: Array, weights: Array
 ) -> tuple[ChainState, NDArray[np.bool_]]:
-    """Return the initial state, and the instants at which a segment is undetermined.
+    """Return the initial state, and a mask of the instants at which a segment is undetermined.
 
     Parameters
     ----------
@@ -109,7 +109,10 @@ def _with_center(
 def _fit_cloud(
     points: Array, measured: Array, weights: Array, rest: Array
 ) -> tuple[Array, Array, Array]:
-    """Return rotation (T, 3, 3), origin (T, 3) and second moment, m^2, (T,) of a marker cloud."""
+    """Return rotation (T, 3, 3), origin (T, 3) and second largest moment (T,) of a marker cloud.
+
+    The moment, m², is an upper bound.
+    """
     total = np.maximum(weights.sum(axis=-1), 1e-12)[:, None]
     middle_p = (points @ weights[..., None])[..., 0] / total
     middle_y = (measured @ weights[..., None])[..., 0] / total
@@ -120,7 +123,7 @@ def _fit_cloud(
     B = (y * weights[:, None]) @ np.swapaxes(p, -1, -2)
     R = _nearest_rotation(B + (_PULL_TO_REST * size + 1e-12)[:, None, None] * rest)
     minors = 0.5 * (size**2 - np.einsum("tij,tij->t", moments, moments))
-    second = minors / np.maximum(size, 1e-12)  # upper bound of the eigenvalue
+    second = minors / np.maximum(size, 1e-12)  # upper bound of the second eigenvalue
     return R, middle_y - (R @ middle_p[..., None])[..., 0], second
 
 
@@ -153,6 +156,8 @@ def _about_axis(rest: Array, turned: Array, axis: tuple[float, float, float]) ->
 
     .. math:: \tan\theta = \frac{\sum_{ij} R_{ij} [a]_{\times,ij}}{tr R - a^T R a}, \qquad
               R = R_{rest}^T R_{turned}
+
+    where θ is the angle of the hinge and a its axis.
     """
     R, a = rest.T @ turned, np.asarray(axis)
     along = np.einsum("tij,ij->t", R, rotation.skew(a))

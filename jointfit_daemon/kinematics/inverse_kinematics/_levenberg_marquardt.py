@@ -1,8 +1,8 @@
 r"""Levenberg-Marquardt search over many instants, each of which has its own damping.
 
 Invariant: a step is accepted only at instants where the step lowers the cost. At other instants the
-damping is increased. Converged instants are excluded. In addition to the marker errors the cost
-contains *bands*, which penalize joint rotations outside a range:
+damping is increased. Converged instants take no further steps. In addition to the marker errors the
+cost contains *bands*, which penalize joint rotations outside a range:
 
 .. math:: \sum_k w_k \left(v_k - clip(v_k, low_k, high_k)\right)^2, \qquad
           v = \log(A_{ref}^T A)

@@ -144,7 +144,12 @@ def marker_fit(slots: MarkerSlots, state: ChainState, measured: Array, weights: 
 
 
 def _sums_to_inertia() -> Array:
-    """Return the map of the sums (x, y, z, 1) w (x, y, z, 1, e)^T to (I, (x x e, e)), 6 x 7."""
+    """Return the matrix that maps sums over the markers of a segment to I and to the gradient.
+
+    The sums are w (x, y, z, 1) (x, y, z, 1, e)^T for markers with the position x, the error e and
+    the weight w. The result has the shape (28, 42). It maps the 28 sums to a 6 x 7 matrix, which
+    contains I in six columns and the sums of w (x × e, e) in the last column.
+    """
     out = np.zeros((4, 7, 6, 7))
     cross = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
     for i, j, k in cross:

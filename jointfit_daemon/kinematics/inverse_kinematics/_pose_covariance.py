@@ -43,8 +43,8 @@ def pose_covariance(model: ChainModel, found: IkResult) -> tuple[Array, NDArray[
         nq).
     determined
         Mask, shape (T, nq). It is False if the information about a degree of freedom, while all
-        other degrees of freedom are free, is less than the information of one marker 2 cm from its
-        axis.
+        other degrees of freedom are free, is less than the information of one marker that is 2 cm
+        from the axis of this degree of freedom.
     """
     w = found.weights
     seen = np.where(np.isfinite(found.residuals).all(axis=-1), w, 0.0) > 0.0

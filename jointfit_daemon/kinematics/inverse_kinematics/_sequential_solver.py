@@ -85,11 +85,11 @@ class LiveOptions:
     m^2/rad^2.
     """
     marker_sd_m: float | None = None
-    """Marker error per axis, m. If None, it is estimated from the residuals of the last 50
-    instants.
+    """Marker error per axis, m. If None, the solver estimates it from the residuals, with a time
+    constant of 50 instants.
     """
     lost_m: float = 0.06
-    """Tracking error, m, above which an instant restarts from the markers alone."""
+    """Weighted RMS marker error, m, above which the solver restarts from the markers alone."""
     restart_interval: int = 1
     """Smallest number of instants between two restarts, which take much longer than a step."""
 
@@ -110,8 +110,8 @@ class LivePose:
     """Covariance of the step from the true state to the estimate, rad^2 and m^2, shape (nq, nq)."""
     determined: NDArray[np.bool_]
     """Mask of the degrees of freedom that the markers determine, shape (nq,). The information about
-    such a degree of freedom, while all others are free, is at least the information of one marker
-    2 cm from its axis.
+    each of them, while all others are free, is at least the information of one marker that is 2 cm
+    from the axis of the degree of freedom.
     """
     underdetermined: bool
     """Whether the markers do not determine a degree of freedom, which then keeps its last value."""

@@ -7,8 +7,8 @@ At every instant
 is computed by the Levenberg-Marquardt method, where x are marker positions of the model, y measured
 positions and w weights. All instants are solved in parallel, each with its own damping. Missing
 markers (NaN) have the weight 0. If the markers do not determine a degree of freedom at an instant,
-the result marks this instant. A second pass solves these instants in order. The search at each
-instant starts from the preceding pose and is regularized toward this pose.
+the result marks this instant. A second pass solves these instants again, in order of time. The
+search at each of them starts from the preceding pose and is regularized toward this pose.
 """
 
 from __future__ import annotations
