@@ -8,7 +8,7 @@ from collections import Counter
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path  # noqa: TC003 - typer reads annotations at run time
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import orjson
@@ -95,18 +95,24 @@ _MOST_DISCARDED = 0.9
 """Share of discarded bytes above which a capture without orientations belongs to another device."""
 
 
+_File = Annotated[Path, typer.Argument(help="Capture: raw bytes, pcapng, pcap, or `candump` log.")]
+_JsonLines = Annotated[
+    bool, typer.Option("--jsonl", help="Print one JSON object per decoded item.")
+]
+
+
 def decode(
     protocol: Annotated[
         str,
         typer.Argument(
-            help="Driver of the recorded device, such as xbus; `jointfit check` lists all.",
+            help="Driver of the recorded device, such as xbus; `jointfit check` lists all drivers.",
             autocompletion=complete_driver,
         ),
     ],
-    file: Annotated[Path, typer.Argument(help="Raw bytes, pcapng, pcap, or `candump` log.")],
+    file: _File,
     *,
-    jsonl: Annotated[bool, typer.Option("--jsonl", help="One JSON object per item.")] = False,
-    summary: Annotated[bool, typer.Option("--summary", help="Print counts as JSON.")] = False,
+    jsonl: _JsonLines = False,
+    summary: Annotated[bool, typer.Option("--summary", help="Print the counts as JSON.")] = False,
     setting: Annotated[
         list[str] | None,
         typer.Option(
@@ -116,7 +122,7 @@ def decode(
         ),
     ] = None,
 ) -> None:
-    """Decode a capture of an installed driver: table of counts, JSON lines, or JSON summary."""
+    """Decode a capture with an installed driver: table of counts, JSON lines, or JSON summary."""
     from jointfit_daemon.driver import find_driver
 
     driver = find_driver(protocol)
@@ -159,10 +165,8 @@ def _read(
     """Return the chunks of a capture.
 
     If the capture is of another type of connection, the error message lists the drivers for that
-    type.
-
-    If the capture contains several network connections, the decoder from `decoder_of` selects the
-    one with the most messages.
+    type. If the capture contains several network connections, the connection in which the decoder
+    from `decoder_of` finds the most messages is selected.
     """
     from jointfit_daemon.files.captures import UnreadableCaptureError, read_capture
     from jointfit_daemon.tools.discovery import installed_drivers
@@ -217,9 +221,7 @@ def _why_nothing_found(file: Path, driver: type[Driver], name: str) -> str:
 
 
 def _toml(key: str, value: Any) -> str:
-    from jointfit_daemon.files.text import (
-        toml_value,
-    )  # loads numpy slowly
+    from jointfit_daemon.files.text import toml_value  # slow, because it imports numpy
 
     return toml_value(value, hexadecimal=key == "ids")
 

@@ -32,7 +32,8 @@ def decoder_settings(driver: type[Driver], name: str, given: Mapping[str, Any]) 
                 table[key] = {"interface": "virtual", "channel": "file"}
             elif get_origin(info.annotation) is Literal and 1 not in get_args(info.annotation):
                 continue  # no placeholder, so the validation reports the key
-            elif not models and get_origin(info.annotation) is not dict:  # not a data description
+            elif not models and get_origin(info.annotation) is not dict:
+                # The key is a single value. Tables have no placeholder.
                 table[key] = "file" if str in kinds else 1
     try:
         return driver.Settings.model_validate(table)

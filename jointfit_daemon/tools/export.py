@@ -55,8 +55,8 @@ def export(
 ) -> None:
     """Write a recording or a trial in formats of OpenSim, pandas, MNE, Foxglove and others.
 
-    Reports what is left out or resampled. If the export to a format fails, no file of this format
-    is written.
+    The command reports which data are left out or resampled. If the export to a format fails, no
+    file of this format is written.
     """
     from jointfit_daemon.files.sessions import SESSION_FORMATS, write_session
 

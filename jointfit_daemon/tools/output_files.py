@@ -37,7 +37,7 @@ def check_output(option: str, path: Path | None, endings: Sequence[str]) -> None
     if not folder.is_dir():
         raise ValueError(
             f"{option} {path}: folder {str(folder)!r} does not exist: create it (mkdir -p), or"
-            " choose another"
+            " choose another folder"
         )
 
     if path.is_dir():

@@ -18,7 +18,7 @@ def recover(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Clean file; default: NAME.mcap for NAME.mcap.part, else NAME-clean.mcap."
+            help="Clean file to write; default: NAME.mcap for NAME.mcap.part, else NAME-clean.mcap."
         ),
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
@@ -26,8 +26,8 @@ def recover(
     """Copy the readable messages of a damaged recording to a clean file, and list what is missing.
 
     The commands of jointfit also read damaged recordings; other programs need a clean file. The
-    source is not changed. Exit codes: 0 copied; 1 the file cannot be read or written; 2 it is not a
-    recording.
+    damaged file is not changed. Exit codes: 0 copied; 1 the file cannot be read or written; 2 the
+    file is not a recording.
     """
     from jointfit_daemon.outputs.recording import repair_recording
 

@@ -23,12 +23,13 @@ def request(
     name: Annotated[
         str,
         typer.Argument(
-            help="Request, such as selftest; the documentation has a table.",
+            help="Name of the request, such as selftest; the documentation lists all requests.",
             autocompletion=complete_request,
         ),
     ],
     arguments: Annotated[
-        str, typer.Argument(help='Its arguments as a JSON object, such as {"device":"S1"}.')
+        str,
+        typer.Argument(help='Arguments of the request as a JSON object, such as {"device":"S1"}.'),
     ] = "{}",
     *,
     rig: _Rig = Path("rig.toml"),
@@ -46,7 +47,7 @@ def request(
         table = orjson.loads(arguments)
     except orjson.JSONDecodeError as error:
         raise ValueError(
-            f"the arguments are no JSON ({error}): expected an object in quotes, such as "
+            f"the arguments are not JSON ({error}): expected an object in quotes, such as "
             '\'{"device":"S1"}\''
         ) from error
     if not isinstance(table, dict):

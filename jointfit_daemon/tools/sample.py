@@ -18,7 +18,7 @@ def sample(
     *,
     seed: Annotated[int, typer.Option(help="Random seed: selects the simulated subject.")] = 1,
     force: Annotated[bool, typer.Option("--force", help="Write into a non-empty folder.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the list as JSON.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the list of files as JSON.")] = False,
 ) -> None:
     """Write sample data: short trials of a simulated leg, a chain model, captures and a rig."""
     # The simulator is a separate program that shares no code with the estimators.

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Signals that stop a command: of Ctrl-C, of a service manager or `kill`, and of a closed terminal.
-"""
+"""Signals that stop a command. Ctrl-C, a service manager or `kill`, and a closed terminal send
+these signals."""
 _EXIT_BASE = 128
 """Offset of the exit code. By the convention of shells, a process that signal N stops has the code
 128 + N."""

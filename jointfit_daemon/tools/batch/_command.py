@@ -18,6 +18,12 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.tools.batch.recording_task import RecordingResult
 
+_To = Annotated[str, typer.Option("--to", help="Formats of the step export, separated by commas.")]
+_Jobs = Annotated[
+    int | None,
+    typer.Option("--jobs", min=1, help="Number of processes; default: one per processor."),
+]
+
 
 def batch(
     folder: Annotated[Path, typer.Argument(help="Folder with recordings, searched recursively.")],
@@ -26,24 +32,23 @@ def batch(
         str,
         typer.Option("--do", help="Steps, separated by commas: calibrate, replay, export, report."),
     ] = "report",
-    to: Annotated[str, typer.Option("--to", help="Formats of the step export.")] = "csv",
+    to: _To = "csv",
     out: Annotated[
         Path | None, typer.Option("--out", help="Output folder; default: FOLDER/batch.")
     ] = None,
-    jobs: Annotated[
-        int | None, typer.Option("--jobs", min=1, help="Processes; default: one per processor.")
-    ] = None,
+    jobs: _Jobs = None,
     scheduler: Annotated[
-        str | None, typer.Option("--scheduler", help="Dask cluster instead: tcp://HOST:8786.")
+        str | None, typer.Option("--scheduler", help="Run on this Dask cluster: tcp://HOST:8786.")
     ] = None,
     json: Annotated[
         bool, typer.Option("--json", help="Print the rows of the summary as JSON.")
     ] = False,
 ) -> None:
-    """Process every recording of a folder, and summarize them in a table.
+    """Process every recording of a folder, and summarize the results in a table.
 
-    A batch that was stopped continues where it was: recordings whose bytes and steps are unchanged
-    are not processed again. Exit codes: 0 all recordings are processed; 1 at least one failed.
+    A repeated batch skips every recording that it has already processed, unless the bytes of the
+    recording, the steps, the formats or the version of this program changed. Exit codes: 0 all
+    recordings are processed; 1 at least one failed.
     """
     from jointfit_daemon.files.sessions import SESSION_FORMATS
     from jointfit_daemon.tools.batch.executors import run_in_pool, run_on_cluster
@@ -54,7 +59,9 @@ def batch(
     steps = _words("--do", do, STEPS)
     formats = _words("--to", to, [*SESSION_FORMATS]) if "export" in steps else ()
     if scheduler is not None and jobs is not None:
-        raise ValueError("--jobs: the cluster of --scheduler has its own workers: omit one option")
+        raise ValueError(
+            "--jobs and --scheduler: expected only one of them: a cluster has its own workers"
+        )
     if not folder.is_dir():
         raise ValueError(f"{folder}: expected a folder with recordings")
     output = (folder / "batch" if out is None else out).resolve()

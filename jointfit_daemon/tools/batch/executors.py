@@ -1,7 +1,6 @@
 """Execution of tasks in a pool of processes, or on an existing Dask cluster.
 
-Invariant: every task yields exactly one result. If a process dies, only the task that caused the
-failure fails.
+Invariant: every task yields exactly one result. If a task ends its process, only this task fails.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ _AHEAD = 2
 """Number of submitted tasks per process. The second task prevents an idle time between tasks."""
 _DIED = (
     "the process that read this recording was ended, probably by the system for lack of memory:"
-    " process it on a computer with more memory"
+    " process the recording on a computer with more memory"
 )
 
 

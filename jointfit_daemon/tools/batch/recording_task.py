@@ -103,7 +103,7 @@ def finished_result(task: RecordingTask, digest: str) -> RecordingResult | None:
 
 
 def process_recording(task: RecordingTask) -> RecordingResult:
-    """Run the steps of a task unless their result exists; the result contains any errors."""
+    """Run the steps of a task unless their result is stored. An error becomes a failed result."""
     try:
         digest = task_digest(task)
         known = finished_result(task, digest)
@@ -172,7 +172,7 @@ def _run_steps(task: RecordingTask, folder: Path) -> RecordingResult:
 
 
 def _calibrate(recording: Path, folder: Path, notes: list[str]) -> Calibration | None:
-    """Calibrate from a recording; return None, and add a note, if no calibration results."""
+    """Calibrate from a recording. Without a calibration as result, add a note and return None."""
     from jointfit_daemon.reprocessing import ReprocessingError, calibrate_recording
     from jointfit_daemon.tools.calibrate import store_offline_calibration
 

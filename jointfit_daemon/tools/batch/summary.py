@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 _UNKNOWN = "–"
 _HEAD = (
-    "Recording", "Status", "Duration, s", "RMS against cameras", "Largest range", "Gait cycles",
-    "Lost, %", "Faults", "Gaps", "Replay", "Notes",
+    "Recording", "Status", "Duration, s", "RMS difference from cameras", "Largest range of motion",
+    "Gait cycles", "Samples lost, %", "Faults", "Gaps", "Replay", "Notes",
 )  # fmt: skip
 
 

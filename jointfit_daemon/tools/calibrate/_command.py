@@ -1,4 +1,4 @@
-"""Command `jointfit calibrate`: requests calibration phases over MQTT and reports their result.
+"""Command `jointfit calibrate`: requests calibration phases over MQTT and reports their results.
 
 Invariants: only the result is written to stdout; prompts, progress and warnings are written to
 stderr. If the command is stopped during a phase that it started, it first aborts this phase,
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.outputs.mqtt import MqttClient
 
 EXIT_REJECTED = 3
-"""Exit code if the new calibration is worse than the stored one."""
+"""Exit code if the new calibration is worse than the stored calibration."""
 ABORT_S = 2.0
 """Longest wait for the daemon's answer to an abort request, s."""
 LONGEST_S = 600.0
@@ -63,16 +63,18 @@ _List = Annotated[
 _Use = Annotated[int | None, typer.Option("--use", help="Use this stored version again.", min=1)]
 _Recording = Annotated[
     Path | None,
-    typer.Option(help="Repeat the calibration of a recorded session instead, without a daemon."),
+    typer.Option(help="Repeat the calibration of a recorded session, without a daemon."),
 ]
 _OtherRig = Annotated[
-    Path | None, typer.Option("--rig", help="With --recording: use this rig.toml instead.")
+    Path | None, typer.Option("--rig", help="With --recording: replaces the recorded rig.toml.")
 ]
 _Out = Annotated[
     Path | None,
     typer.Option(help="With --recording: write to this .json file instead of the store."),
 ]
-_Revert = Annotated[bool, typer.Option("--revert", help="Use the version before the active one.")]
+_Revert = Annotated[
+    bool, typer.Option("--revert", help="Use the version before the active version.")
+]
 
 
 class StandardInputClosedError(ValueError):
@@ -103,7 +105,8 @@ _Seconds = Annotated[
     typer.Option(help="Duration of each phase, s, up to 600. Default: from rig.toml."),
 ]
 _Force = Annotated[
-    bool, typer.Option("--force", help="Accept a calibration that is worse than the stored one.")
+    bool,
+    typer.Option("--force", help="Accept a calibration that is worse than the stored calibration."),
 ]
 
 
@@ -125,7 +128,7 @@ def calibrate(
 ) -> None:
     """Calibrate the rig of a running daemon; Ctrl-C or SIGTERM aborts the phase.
 
-    With --recording, the requests in a recording start the same phases, and the result is stored.
+    With --recording, the command repeats the recorded phases and stores their result.
 
     Exit codes: 0 success; 1 no broker, no daemon, a phase was refused or aborted, or its result
     could not be stored; 2 invalid options or rig.toml; 3 the result is worse than the stored
@@ -148,7 +151,7 @@ def calibrate(
         _print_status(status, json=json)
         return
     if rig is not None or out is not None:
-        raise ValueError(f"{'--rig' if rig else '--out'}: expected --recording with it")
+        raise ValueError(f"{'--rig' if rig else '--out'}: valid with --recording only")
     if listed:
         list_versions(config, json=json)
         return

@@ -167,7 +167,10 @@ class PhaseTracker:
             await self._next_message()
 
     async def wait_for_final(self, phase: str) -> Mapping[str, Any]:
-        """Return the status after the end of `phase`: aborted, stored, or after `STORING_S`."""
+        """Return the status after the end of `phase`.
+
+        A phase that was not aborted has `STORING_S` to store its result.
+        """
         while self.status is self._status_before or self.status.get("phase") in (phase, "fitting"):
             await self._next_message()
         ended = self.status

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 MOVED_M = 0.008
-"""Displacement of a marker, m, above which an impact is the probable cause. Soft tissue moves
+"""Displacement, m, above which a marker probably was pushed out of its place. Soft tissue moves
 markers by about 5 mm."""
 
 
@@ -36,7 +36,9 @@ def report(quality: Mapping[str, Any]) -> list[str]:
     for name, part in (markers.get("parts") or {}).items():
         before, after = (1000 * part[key] for key in ("before_m", "after_m"))
         kept = "" if part.get("refined") else ", positions of the static pose retained"
-        lines.append(f"{name}: RMS marker error {before:.1f} mm, refined {after:.1f} mm{kept}")
+        lines.append(
+            f"{name}: RMS marker error {before:.1f} mm, after refinement {after:.1f} mm{kept}"
+        )
 
     moved: Mapping[str, float] = markers.get("moved_m") or {}
     lines += [
@@ -127,8 +129,8 @@ def _chain_lines(chain: Mapping[str, Any]) -> list[str]:
     )
     limits = "within" if chain["after"]["accepted"] else "ABOVE"
     first = (
-        f"{name}: marker error {rms:.1f} mm RMS, {most:.0f} mm at most; refined {new_rms:.1f} and "
-        f"{new_most:.0f} mm, {limits} the accepted errors"
+        f"{name}: marker error {rms:.1f} mm RMS, {most:.0f} mm at most; after refinement "
+        f"{new_rms:.1f} and {new_most:.0f} mm, {limits} the accepted errors"
     )
     kept = [part for part, one in chain["parts"].items() if not one["refined"]]
     moved = {marker: 1000 * m for marker, m in chain["moved_m"].items() if m >= MOVED_M}

@@ -57,7 +57,7 @@ _PrintOnly = Annotated[
 def calibrate_sensor(
     name: Annotated[
         str,
-        typer.Argument(metavar="ID", help="Sensor of rig.toml.", autocompletion=complete_sensor),
+        typer.Argument(metavar="ID", help="Sensor id in rig.toml.", autocompletion=complete_sensor),
     ],
     *,
     rig: Annotated[
@@ -76,8 +76,8 @@ def calibrate_sensor(
     poses; and hard and soft iron of the magnetometer from free rotation. Each step ends by itself.
     The result is written into the table imu.sensor_calibration of rig.toml, which the daemon uses
     from its next start or reload. Exit codes: 0 all steps have a result; 1 the sensor is lost, or a
-    step was refused (the results of the others are written); 2 invalid options or rig.toml; 128 + N
-    stopped by signal N, nothing was written.
+    step was refused (the results of the other steps are written); 2 invalid options or rig.toml;
+    128 + N stopped by signal N, nothing was written.
     """
     from jointfit_daemon.config import load_rig
     from jointfit_daemon.tools.text_output import echo_json, echo_wrapped
@@ -131,7 +131,7 @@ def _sensor(rig: Rig, name: str) -> Source:
 
 
 def _calibratable(rig: Rig, name: str, configured: Source) -> Source:
-    """Return the sensor to calibrate, whose orientation the gateway must compute."""
+    """Return the sensor; raise ValueError unless the gateway computes its orientation."""
     from jointfit_daemon.sensor_calibration import CalibratableSettings
 
     for source in (configured, _sensor(rig, name)):

@@ -41,8 +41,8 @@ STEPS: dict[str, type[Step]] = {
 }
 INSTRUCTIONS = {
     "gyroscope": "Lay {id} on a table and do not touch it until the next step.",
-    "accelerometer": "Lay {id} on each of its six faces, then lean it in six tilted poses; let go "
-    "of it for two seconds in each. The order does not matter.",
+    "accelerometer": "Lay {id} on each of its six faces, then lean it against an object in six "
+    "tilted poses. Let go of it for two seconds in each pose. The order does not matter.",
     "magnetometer": "Hold {id} in your hand, away from steel, and turn it slowly on the spot until "
     "each of its sides has pointed in every direction.",
 }
@@ -55,13 +55,13 @@ _SHOW_S = 0.25
 
 @dataclass(slots=True)
 class SensorFindings:
-    """Results of the steps."""
+    """Results of the calibration steps."""
 
     estimates: dict[str, Estimate] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
     """Reason why a step has no result, by step."""
     not_estimated: dict[str, str] = field(default_factory=dict)
-    """Reason why an additional quantity is not estimated, by step."""
+    """Reason why an additional quantity is not estimated, by quantity."""
     serial: str | None = None
     """Serial number, if the sensor reported one."""
     warnings: list[str] = field(default_factory=list)
@@ -191,7 +191,9 @@ async def _wait_for(
             if isinstance(error, DeviceLostError | DeviceMisconfiguredError):
                 raise SensorCalibrationError(f"{name}: {error}") from error
             reading.result()
-            raise SensorCalibrationError(f"{name}: its driver ended without an error: repeat")
+            raise SensorCalibrationError(
+                f"{name}: its driver ended without an error: repeat the calibration"
+            )
         display.show(step.progress)
     display.show(step.progress)
 

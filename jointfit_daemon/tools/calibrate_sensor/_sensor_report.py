@@ -46,28 +46,28 @@ def _lines(estimate: Estimate) -> list[str]:
     common = f"scale errors {_numbers(scales, 2)} %, standard deviation {scale_sd:.2f}"
     if isinstance(estimate, GyroscopeScaleEstimate):
         off = np.abs(estimate.matrix - np.diag(np.diag(estimate.matrix))).max()
-        axes = f"; axes {np.rad2deg(off):.2f} deg off those of the accelerometer"
+        axes = f"; axes {np.rad2deg(off):.2f} deg from the accelerometer axes"
         return [
             f"  gyroscope scale: errors {_numbers(scales, 2)} %, standard deviation "
             f"{scale_sd:.2f}{'' if np.isnan(estimate.matrix_sd[0, 1]) else axes}",
             f"    {estimate.turns} turns, {np.rad2deg(estimate.angle):.0f} deg in all; direction "
-            f"of gravity wrong by {np.rad2deg(estimate.spread_before):.2f} deg (RMS) before, "
-            f"{np.rad2deg(estimate.residual):.2f} after",
+            f"of gravity wrong by {np.rad2deg(estimate.spread_before):.2f} deg (RMS) before "
+            f"correction, {np.rad2deg(estimate.residual):.2f} after",
         ]
     if isinstance(estimate, AccelerometerEstimate):
         axes = "" if np.isnan(estimate.matrix_sd[0, 1]) else f"; axes {_axes(estimate.matrix)}"
         return [
             f"  accelerometer: bias {_numbers(estimate.bias, 3)} m/s², standard deviation "
             f"{estimate.bias_sd.max():.3f}; {common}{axes}",
-            f"    |a| differs from gravity by {estimate.spread_before:.3f} m/s² (RMS) before, "
-            f"{estimate.residual:.3f} after, in {estimate.poses} poses",
+            f"    |a| differs from gravity by {estimate.spread_before:.3f} m/s² (RMS) before "
+            f"correction, {estimate.residual:.3f} after, in {estimate.poses} poses",
         ]
     missing = f"; missing directions: {', '.join(estimate.missing)}" if estimate.missing else ""
     return [
         f"  magnetometer: offset {_numbers(estimate.bias, 3)}, standard deviation "
         f"{estimate.bias_sd.max():.3f}, in a field of {estimate.magnitude:.3f} (unit of the "
         f"device); {common}; axes {_axes(estimate.matrix)}",
-        f"    |m| varies by {100 * estimate.spread_before:.1f} % before, "
+        f"    |m| varies by {100 * estimate.spread_before:.1f} % before correction, "
         f"{100 * estimate.residual:.1f} % after, in {estimate.readings} readings{missing}",
     ]
 
@@ -95,6 +95,6 @@ def _numbers(values: Array, digits: int) -> str:
 
 
 def _axes(matrix: Array) -> str:
-    """Return the largest deviation from a right angle between two axes."""
+    """Return the largest deviation from a right angle between two axes, as text."""
     skew = np.rad2deg(np.abs(np.array((matrix[0, 1], matrix[0, 2], matrix[1, 2]))).max() * 2.0)
     return f"{skew:.2f} deg from perpendicular"

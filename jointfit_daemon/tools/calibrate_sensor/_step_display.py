@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration.inertial_sensor import StepProgress
 
 _EVERY_S = 5.0
-"""Time between two lines if nothing has changed, s."""
+"""Shortest time between two lines, s. The line of a complete step is printed at once."""
 
 
 class StepDisplay:

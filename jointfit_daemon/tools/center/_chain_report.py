@@ -78,7 +78,7 @@ def _trajectory_row(joint: ChainJoint, rate_hz: float) -> tuple[str, ...]:
 def _notes(joint: ChainJoint) -> Iterator[str]:
     used = [s.answer.estimate for s in joint.sides if s.answer.estimate.refused is None]
     if used and all(len(e.unseen) for e in used):
-        yield "its position along the joint axis is unobservable and not part of its error"
+        yield "its position along the joint axis is unobservable; its error excludes this direction"
     yield from joint.faults
 
 

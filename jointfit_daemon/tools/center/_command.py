@@ -21,9 +21,12 @@ if TYPE_CHECKING:
 
 
 _Parent = Annotated[
-    str | None, typer.Option("--parent", help="Parent markers M1,M2,M3; M1,M2 with --plane.")
+    str | None,
+    typer.Option("--parent", help="Markers of the parent segment: M1,M2,M3; with --plane M1,M2."),
 ]
-_Children = Annotated[str | None, typer.Option("--markers", help="Child markers M4,M5,...")]
+_Children = Annotated[
+    str | None, typer.Option("--markers", help="Markers of the child segment: M4,M5,...")
+]
 _Segments = Annotated[
     list[str] | None,
     typer.Option(
@@ -32,7 +35,10 @@ _Segments = Annotated[
         " option from one end of the chain to the other.",
     ),
 ]
-_Joints = Annotated[str | None, typer.Option("--joints", help="Names of the joints of the chain.")]
+_Joints = Annotated[
+    str | None,
+    typer.Option("--joints", help="Names of the joints of the chain, separated by commas."),
+]
 _Trajectory = Annotated[
     Path | None,
     typer.Option("--trajectory", help="Write the joint positions of all frames: .trc or .csv."),
@@ -45,23 +51,29 @@ _Method = Annotated[
     str,
     typer.Option(
         "--method",
-        help="sphere, score, sara, halvorsen, ...; with --plane hyper, pratt, taubin, kasa, "
-        "geometric, ...; auto selects one.",
+        help="Estimator: sphere, score, sara, halvorsen, ...; with --plane hyper, pratt, taubin, "
+        "kasa, geometric, ...; auto selects an estimator.",
     ),
 ]
 _Plane = Annotated[
     str | None,
-    typer.Option("--plane", help="Planar movement: the file's axis normal to the plane."),
+    typer.Option(
+        "--plane", help="For planar movement: axis of the file normal to the plane, x, y or z."
+    ),
 ]
 _Window = Annotated[
-    float | None, typer.Option("--window", min=0.05, help="Estimate per window of SECONDS.")
+    float | None,
+    typer.Option("--window", min=0.05, help="One estimate per window of this duration, s."),
 ]
 _Up = Annotated[
-    str | None, typer.Option("--up", help="Vertical axis, if the file does not define it.")
+    str | None,
+    typer.Option("--up", help="Vertical axis x, y or z, if the file does not define it."),
 ]
 _Plot = Annotated[
     Path | None,
-    typer.Option("--plot", help="Plot the centre, or a stick figure: .png, .svg or .pdf."),
+    typer.Option(
+        "--plot", help="Plot the centre, or the chain as a stick figure: .png, .svg or .pdf."
+    ),
 ]
 
 
@@ -78,14 +90,14 @@ def center(
     plane: _Plane = None,
     window: _Window = None,
     up: _Up = None,
-    json: Annotated[bool, typer.Option("--json", help="One JSON object in SI units.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON in SI units.")] = False,
     plot: _Plot = None,
 ) -> None:
     """Estimate the centre of rotation of a joint, with its uncertainty.
 
-    The centre is given in the frame of the parent's markers. With --segment, all joints of a chain
-    are estimated, and --trajectory writes their positions in every frame. Exits with 1 if every
-    estimate, or a joint of the chain, is refused.
+    The centre is given in the frame that the parent markers define. With --segment, all joints of a
+    chain are estimated, and --trajectory writes their positions in every frame. Exits with 1 if
+    every estimate, or a joint of the chain, is refused.
     """
     from jointfit_daemon.files.mocap import read_marker_trial
     from jointfit_daemon.tools.center._chain_command import ChainOptions, reconstruct_chain
@@ -144,7 +156,7 @@ def _one_joint(
 def _segments(
     parent: str | None, markers: str | None, segment: list[str] | None, window: float | None
 ) -> list[list[str]]:
-    """Return the markers of each segment; --parent and --markers are a chain of two."""
+    """Return the markers of each segment; --parent and --markers are a chain of two segments."""
     if window is not None:
         raise ValueError(
             "--window is for one joint: omit --window, or omit --segment and --trajectory"

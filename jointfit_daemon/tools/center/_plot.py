@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _MOST_POINTS = 600
 """Largest number of plotted samples of a marker. It limits the size of vector graphics."""
 _END_ON = 0.1
-"""If the projection of a unit vector is shorter, the view is treated as parallel to this vector."""
+"""Smallest projected length of a unit vector whose direction is drawn as a line."""
 
 
 def draw_center(

@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.center.trial import ParentFrameMotion, WindowEstimate
 
 _FLAGS = {
-    "orientation_inconsistent": "inertial angles disagree with the circle fit, which was used",
+    "orientation_inconsistent": "inertial angles contradict the circle fit; the circle fit is used",
     "residuals_persist": "residuals are correlated over time: frames are not independent",
     "residuals_repeat": "residuals repeat with posture, as soft-tissue artefact does: repetitions"
     " of the movement are counted once",
-    "hinge": "rotation about one axis: the position of the centre along it is unobservable",
+    "hinge": "rotation about one axis: the position of the centre along the axis is unobservable",
 }
 _WINDOW_HEAD = (
     "window, s",
@@ -105,7 +105,7 @@ def details(answer: WindowEstimate) -> str:
 
 
 def sd_seen(answer: WindowEstimate) -> float:
-    """Return the predicted RMS error in the observable directions, m."""
+    """Return the predicted RMS error in the observable directions, m; infinite without any."""
     e = answer.estimate
     if len(e.unseen) >= len(e.center):
         return inf
@@ -150,7 +150,7 @@ def _semi_axes(answer: WindowEstimate) -> str:
 
 
 def mm(metres: float) -> str:
-    """Return a length in mm."""
+    """Return a length as text in mm."""
     if not isfinite(metres):
         return "unknown"
     size = MM_PER_M * metres

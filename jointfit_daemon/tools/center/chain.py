@@ -59,7 +59,7 @@ class ChainJoint:
 
     @property
     def refused(self) -> bool:
-        """Whether the centres in both segments were refused."""
+        """Whether the estimates from all `sides` were refused."""
         return all(side.answer.estimate.refused is not None for side in self.sides)
 
 
@@ -79,7 +79,9 @@ def joint_names(count: int, names: Sequence[str]) -> list[str]:
             " segments, from the first to the last"
         )
     if several := sorted({name for name in names if names.count(name) > 1}):
-        raise UnsuitableTrialError(f"--joints: {', '.join(several)}: use every name once")
+        raise UnsuitableTrialError(
+            f"--joints: {', '.join(several)} named more than once: use each name once"
+        )
     return list(names)
 
 
@@ -165,8 +167,8 @@ def _check_segments(segments: Sequence[Sequence[str]], names: Sequence[str], lea
             raise UnsuitableTrialError(
                 f"--segment: {name} is between {', '.join(first) or 'no marker'} and"
                 f" {', '.join(second) or 'no marker'}, and neither segment has the {least} markers"
-                f" of a frame{space}: add markers to one of the two; only the segments at the ends"
-                " of a chain need fewer"
+                f" that define a frame{space}: add markers to one of the two; only the segments at"
+                " the ends of a chain need fewer"
             )
     if empty := [k + 1 for k, segment in enumerate(segments) if not segment]:
         raise UnsuitableTrialError(

@@ -1,8 +1,9 @@
 """Centres of rotation from a marker trial: parent frame, estimates by window, world positions.
 
 The parent frame is defined by the parent's markers, so it is the same in all trials with the same
-marker placement. Its origin is their mean, and x extends from the first to the second marker. In
-space, z is normal to the plane of the first three markers. For planar movement, y is normal to x.
+marker placement. Its origin is the mean of these markers, and x extends from the first to the
+second marker. In space, z is normal to the plane of the first three markers. For planar movement,
+y is normal to x.
 """
 
 from __future__ import annotations
@@ -126,7 +127,7 @@ def reduce(
     """
     if both := sorted(set(parent) & set(markers)):
         raise UnsuitableTrialError(
-            f"{', '.join(both)}: named in --parent and in --markers; remove from one"
+            f"{', '.join(both)}: named in --parent and in --markers; remove them from one option"
         )
 
     _check_parent(trial, parent, MIN_MARKERS if plane is None else LEAST_PLANAR, option)
@@ -142,8 +143,8 @@ def reduce(
     template = moving_template(seen)
     if is_line(template[:MIN_MARKERS]):
         raise UnsuitableTrialError(
-            f"{option}: the first three, {', '.join(parent[:MIN_MARKERS])}, are collinear: list"
-            " a marker off the line among the first three"
+            f"{option}: the first three markers, {', '.join(parent[:MIN_MARKERS])}, are collinear:"
+            " list a marker off the line among the first three"
         )
 
     # Axes of the parent frame as columns.
@@ -183,7 +184,7 @@ def _check_parent(trial: MarkerTrial, parent: Sequence[str], least: int, option:
     if not seen.all(axis=1).any():
         counts = ", ".join(f"{m} {n}" for m, n in zip(parent, seen.sum(axis=0), strict=True))
         raise UnsuitableTrialError(
-            f"{option}: no frame contains all of them (frames by marker: {counts}): omit the marker"
+            f"{option}: no frame contains all markers (frames by marker: {counts}): omit the marker"
             " with the fewest frames"
         )
 

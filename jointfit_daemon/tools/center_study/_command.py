@@ -17,10 +17,13 @@ def center_study(
         Path | None, typer.Option("--out", help="Folder for figures (PNG, SVG) and text.")
     ] = None,
     json: Annotated[
-        Path | None, typer.Option("--json", help="File for all results, including the maps.")
+        Path | None, typer.Option("--json", help="File for all results, including the error maps.")
     ] = None,
     repeats: Annotated[
-        int, typer.Option("--repeats", min=2, help="Runs per cell of a map.")
+        int,
+        typer.Option(
+            "--repeats", min=2, help="Number of random runs for each cell of an error map."
+        ),
     ] = 1000,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Random seed.")] = 1,
 ) -> None:

@@ -29,20 +29,20 @@ NEAREST = {"α–σ": 0.3, "r–σ": None, "r–α": 0.15}
 CAVEATS = (
     "Three noisy points can be collinear, so the error of the analytic solution has no finite"
     " mean square: single outliers determine the raw correlation, which changes with the seed."
-    " The printed table therefore requires bounded errors and a small box.",
-    "Clipping limit and box were scanned to approach the printed table (marked *): a fit, not a"
-    " derivation. The source states neither, nor region and step of the grid, and some of its"
+    " The printed table can be approached only with clipped errors and a small box.",
+    "Clipping limit and box were chosen so that the results approach the printed table (marked *)."
+    " The publication states neither of them, and not the region and step of the grid. Some of its"
     " digits are illegible.",
-    "The grid has smaller errors at small α because its box is centered on the true center and"
-    " limits the error: at α = 5° the error equals the box. With three points both methods have"
-    " the same optimum.",
-    "On long arcs a grid with a node on the true center finds it exactly; shifted by half a step"
-    " its error is at least 0.71 steps. Both are shown.",
-    "Equations 14 and 15 of the source are mean squares: F is the root. F holds while σ/r < (1 -"
-    " cos α)/6.",
-    "The all-frames methods use 100 frames of the same arc, not three. hyper refuses runs with T"
-    " < 6, so its RMS covers the other runs. It is biased on short arcs and can be below the"
-    " bound, which holds for unbiased estimators.",
+    "At small α the grid has smaller errors than the analytic solution, because its box is centered"
+    " on the true center and limits the error: at α = 5° the error equals the box. With three"
+    " points both methods have the same optimum.",
+    "On long arcs a grid with a node on the true center finds this center exactly. With the grid"
+    " shifted by half a step, the error is at least 0.71 steps. Both grids are shown.",
+    "Equations 14 and 15 of the publication are mean squares. F is the square root of equation 15"
+    " and is valid while σ/r < (1 - cos α)/6.",
+    "The all-frames methods use 100 frames of the same arc, not three. hyper refuses runs with a"
+    " conditioning T < 6, so its RMS error covers the other runs. hyper is biased on short arcs."
+    " Its error can be below the bound, which holds for unbiased estimators only.",
 )
 _SHOWN_DEG = (5, 10, 20, 30, 45, 60, 90, 120, 150, 175)
 _METHODS = ("predicted", "three frames", "grid", "shifted grid", "bound", "hyper", "oriented")
@@ -71,21 +71,21 @@ def tables(setup: StudySetup, study: Sequence[PairMaps], more: StudyExtension) -
         _setup(setup),
         "Table 1: correlation of whole maps, prediction–analytic / analytic–grid",
         _indent_table(_correlations(study, "grid")),
-        "The same with the grid shifted by half a step",
+        "Table 1 with the grid shifted by half a step",
         _indent_table(_correlations(study, "shifted grid")),
         f"RMS error of the center, mm, at r = {setup.radii[-1]:g} m and"
         f" σ = {MM_PER_M * setup.noise:g} mm; refused: share of runs that hyper refuses",
         _indent_table(_errors(study)),
         f"Median error, mm, of two markers {np.rad2deg(APART_RAD):.0f}° apart that rotate by 2α, at"
         f" r = {setup.radius:g} m and σ = {MM_PER_M * setup.noise:g} mm; bisectors: both markers,"
-        " three frames; Reuleaux and helical axis: both markers, first and last frame; the others:"
-        f" one marker, hyper with {setup.frames} frames",
+        " three frames; Reuleaux and helical axis: both markers, first and last frame; other"
+        f" methods: one marker, hyper with {setup.frames} frames",
         _indent_table(medians),
         f"Repetition of small angles: median error, mm, after averaging {setup.repeats} repetitions"
         f" at r = {setup.radius:g} m and σ = {MM_PER_M * setup.noise:g} mm",
         _indent_table(repetition),
-        "Effect of the radius: 95th percentile of the error, divided by that at"
-        f" r = {100 * setup.radii[-1]:g} cm, α = {np.rad2deg(setup.step):.0f}°,"
+        "Effect of the radius: 95th percentile of the error, divided by the"
+        f" percentile at r = {100 * setup.radii[-1]:g} cm, α = {np.rad2deg(setup.step):.0f}°,"
         f" σ = {MM_PER_M * LARGE_NOISE_M:g} mm",
         _indent_table(
             [

@@ -53,7 +53,7 @@ async def _serve(server: DashboardServer, listen: ListenAddress, listener: socke
                     if fault is not None:
                         print(
                             f"broker {server.broker.text}: {fault}. The page connects as soon as"
-                            " it answers.",
+                            " the broker answers.",
                             file=sys.stderr,
                         )
                 await asyncio.Event().wait()

@@ -82,7 +82,7 @@ def page_context(certificate: Path | None, key: Path | None) -> ssl.SSLContext |
 
 
 def verification_fault(error: ssl.SSLCertVerificationError) -> str:
-    """Return the cause and the remedy if the verification of the broker's certificate fails."""
+    """Return cause and remedy of a failed verification of the broker's certificate."""
     if error.verify_code == _EXPIRED:
         return "its certificate has expired: renew it, or set this machine's clock"
     if error.verify_code == _NOT_YET_VALID:

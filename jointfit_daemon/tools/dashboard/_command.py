@@ -6,7 +6,7 @@ import json
 import os
 import sys
 from dataclasses import asdict
-from pathlib import Path  # noqa: TC003 - typer reads annotations at run time
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -18,27 +18,32 @@ from jointfit_daemon.tools.dashboard.addresses import (
     parse_listen,
 )
 
+_Ca = Annotated[
+    Path | None,
+    typer.Option(
+        help="Certificate of the authority that signed the broker's certificate (mqtts://)."
+    ),
+]
+
 
 def dashboard(
     *,
     listen: Annotated[
-        str, typer.Option(help="Address of the page, HOST:PORT; 0.0.0.0:8080 for other devices.")
+        str, typer.Option(help="Address of the page, HOST:PORT. Other devices need 0.0.0.0:8080.")
     ] = LISTEN,
     broker: Annotated[
         str,
-        typer.Option(help="mqtt://HOST:PORT, mqtts://HOST:PORT with TLS, or wss://HOST/PATH."),
+        typer.Option(help="Broker: mqtt://HOST:PORT, mqtts://HOST:PORT (TLS) or wss://HOST/PATH."),
     ] = "mqtt://localhost:1883",
     base: Annotated[
         str | None, typer.Option(help="Base topic of the rig. Default: the page finds it.")
     ] = None,
-    ca: Annotated[
-        Path | None, typer.Option(help="Certificate of the broker's authority, for mqtts://.")
-    ] = None,
+    ca: _Ca = None,
     certificate: Annotated[
-        Path | None, typer.Option(help="Certificate of this machine: serves the page by HTTPS.")
+        Path | None, typer.Option(help="Certificate of this machine. It turns on HTTPS.")
     ] = None,
     key: Annotated[
-        Path | None, typer.Option(help="Private key of --certificate, if in a file of its own.")
+        Path | None, typer.Option(help="Private key of --certificate, if it is in another file.")
     ] = None,
     name: Annotated[
         list[str] | None,
@@ -46,7 +51,7 @@ def dashboard(
     ] = None,
     set_up: Annotated[
         Path | None,
-        typer.Option("--set-up", help="Folder for a new rig.toml: asks its questions in the page."),
+        typer.Option("--set-up", help="Folder for a new rig.toml. The page asks for its content."),
     ] = None,
 ) -> None:
     """Serve the dashboard: a web page with limb, joint angles, sensors and calibration.
@@ -74,8 +79,8 @@ def dashboard(
         "names": [each.lower() for each in name or ()],
         "set_up": None if rig is None else str(rig),
     }
-    # The server can run for days, so it runs without the command-line libraries, a third of its
-    # memory.
+    # The server can run for days, so it runs without the command-line libraries. They would need a
+    # third of its memory.
     module = "jointfit_daemon.tools.dashboard"
     os.execv(sys.executable, [sys.executable, "-m", module, json.dumps(settings)])  # noqa: S606 - itself
 
@@ -86,7 +91,7 @@ def _new_rig(folder: Path, address: ListenAddress) -> Path:
 
     if not address.is_local:
         raise ValueError(
-            "--set-up writes files and opens devices: use it with --listen 127.0.0.1:8080, on a"
-            " gateway without screen through ssh -L 8080:127.0.0.1:8080"
+            "--set-up writes files and opens devices: use it with --listen 127.0.0.1:8080. If this"
+            " machine has no screen, open the page through ssh -L 8080:127.0.0.1:8080"
         )
     return rig_path(folder).absolute()

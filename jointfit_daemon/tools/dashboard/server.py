@@ -87,7 +87,7 @@ class DashboardServer:
             process_request=self.respond,
             subprotocols=[Subprotocol("mqtt"), Subprotocol("jointfit-set-up")],
             server_header=None,
-            compression=None,  # compression does not pay on a local network
+            compression=None,  # compression saves no time on a local network
             max_size=_PACKET_BYTES,
             ping_interval=_PING_S,
             ping_timeout=_PING_S,
@@ -105,7 +105,7 @@ class DashboardServer:
     def respond(self, connection: ServerConnection, request: Request) -> Response | None:
         """Return the response to a request; None to open the tunnel."""
         del connection
-        method = getattr(request, "method", "GET")  # old websockets versions have no other method
+        method = getattr(request, "method", "GET")  # old versions of websockets accept GET only
         response = self._refusal(request, method) or self._answer(request, method)
         if method == "HEAD" and response is not None:
             response.body = b""  # the response to HEAD keeps its headers
@@ -120,7 +120,7 @@ class DashboardServer:
             return self._text(
                 HTTPStatus.MISDIRECTED_REQUEST,
                 f"The dashboard does not answer to the name {host[0][:80]!r}."
-                " Open it by its IP address, or start it with --name.",
+                " Open it by its IP address, or start the dashboard with --name.",
             )
         if method not in _METHODS:
             refusal = self._text(HTTPStatus.METHOD_NOT_ALLOWED, "The page can only be read.")
@@ -249,7 +249,7 @@ def _authority(origin: str) -> str | None:
 
 
 def _tokens(headers: Headers, name: str) -> set[str]:
-    """Return the elements of all headers `name`, in lower case, whose weight is not 0."""
+    """Return, in lower case, the elements of all headers `name` whose weight is not 0."""
     elements = ",".join(headers.get_all(name)).lower().split(",")
     parts = [element.replace(" ", "").split(";") for element in elements]
     return {token for token, *weight in parts if weight not in (["q=0"], ["q=0.0"], ["q=0.000"])}

@@ -36,7 +36,7 @@ def demo(
     *,
     seconds: Annotated[float, typer.Option(help="Run time after the calibration, s.")] = 30.0,
     headless: Annotated[
-        bool, typer.Option("--headless", help="No display; print the result as one JSON line.")
+        bool, typer.Option("--headless", help="Show no display; print the result as one JSON line.")
     ] = False,
     limb: Annotated[Literal["leg", "legs", "arm", "trunk"], typer.Option(help=_LIMBS)] = "leg",
     seed: Annotated[int, typer.Option(help="Random seed: selects the simulated subject.")] = 1,
@@ -44,25 +44,26 @@ def demo(
         list[str] | None, typer.Option("--set", help="Simulator setting, NAME=VALUE; repeatable.")
     ] = None,
     keep: Annotated[
-        Path | None, typer.Option(help="Folder for rig, logs, calibration and ground truth.")
+        Path | None,
+        typer.Option(help="Keep rig, logs, calibration and ground truth in this folder."),
     ] = None,
     picture: Annotated[Path | None, typer.Option(help="Save the final display as SVG.")] = None,
     web: Annotated[
         bool, typer.Option("--web", help="Show the run in a web page, until Ctrl-C.")
     ] = False,
     listen: Annotated[
-        str, typer.Option(help="Address of the page with --web; 0.0.0.0:8080 for other devices.")
+        str, typer.Option(help="Address of the page with --web. Other devices need 0.0.0.0:8080.")
     ] = LISTEN,
 ) -> None:
     """Run the daemon on simulated hardware; needs no device, broker or root access.
 
-    Starts a broker, a motion-capture server, the daemon and four IMUs: two on pseudo-terminals and
-    two on a CAN adapter (for an arm three each). Then it calibrates, and compares the joint angles
-    with ground truth. Exits with 1 if a step fails or a target is missed: flexion error of the knee
-    (elbow, lumbar joint) at most 3 degrees RMS, all samples accounted for, and 99 % of frames
-    received within 60 ms. Ctrl-C, SIGTERM and SIGHUP stop the run and print the results so far.
-    With --web the limb is calibrated and then moves until the run is stopped, with exit code 0;
-    nothing is compared.
+    The command starts a broker, a motion-capture server, the daemon and four IMUs: two on
+    pseudo-terminals and two on a CAN adapter (for an arm, three and three). Then it calibrates, and
+    compares the joint angles with ground truth. It exits with 1 if a step fails or a target is
+    missed. The targets are: flexion error of the knee (elbow, lumbar joint) at most 3 degrees RMS,
+    all samples accounted for, and 99 % of the frames received within 60 ms. Ctrl-C, SIGTERM and
+    SIGHUP stop the run and print the results so far. With --web, the limb is calibrated and then
+    moves until you stop the run; nothing is compared, and the exit code is 0.
     """
     if not (math.isfinite(seconds) and seconds > 0.0):
         raise ValueError(f"--seconds {seconds:g}: expected a finite number above 0")

@@ -43,8 +43,8 @@ ATTEMPTS = 3
 phase."""
 STOPPED_BY_USER = "abort requested"
 """End of the reason for an abort if a user stopped the phase in the page."""
-LIVE = "The limb is live. Calibrate again in the page; Ctrl-C stops."
-UNCALIBRATED = "The limb is not calibrated. Calibrate it in the page; Ctrl-C stops."
+LIVE = "The page shows the live limb. You can calibrate it again there; Ctrl-C stops the demo."
+UNCALIBRATED = "The limb is not calibrated. Calibrate it in the page; Ctrl-C stops the demo."
 
 
 async def run_web_demo(

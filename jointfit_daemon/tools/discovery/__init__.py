@@ -1,7 +1,8 @@
 """Devices of this host: serial ports, CAN interfaces and motion-capture servers.
 
-Functions named ``find_…`` only read kernel files and open no device. The other functions open only
-the named device, and write nothing to it.
+No function writes to a device or changes it. `find_serial_ports` and `find_can_interfaces` open no
+device, `listen_serial` and `listen_can` open the named device, and `find_mocap_servers` asks over
+the network.
 """
 
 from jointfit_daemon.tools.discovery._can_interfaces import (

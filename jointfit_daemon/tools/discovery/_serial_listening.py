@@ -29,12 +29,12 @@ _DEFAULT_BAUDS = (115_200,)
 _READ_BYTES = 4096
 _POLL_S = 0.05
 _FAULTS = {
-    errno.ENOENT: "is absent: plug it in, or choose one that `jointfit probe` lists",
+    errno.ENOENT: "is absent: plug the adapter in, or choose a port that `jointfit probe` lists",
     errno.EACCES: "permission denied: sudo usermod -aG dialout $USER, then log in again",
     errno.EPERM: "permission denied: sudo usermod -aG dialout $USER, then log in again",
-    errno.EBUSY: "is used by another program: stop it (fuser names it)",
-    errno.ENOTTY: "is not a serial port: choose one that `jointfit probe` lists",
-    errno.EIO: "has no hardware behind it: choose one that `jointfit probe` lists",
+    errno.EBUSY: "is used by another program: stop this program (the command fuser names it)",
+    errno.ENOTTY: "is not a serial port: choose a port that `jointfit probe` lists",
+    errno.EIO: "has no hardware behind it: choose a port that `jointfit probe` lists",
 }
 
 
@@ -55,7 +55,7 @@ class SerialTraffic:
 
 
 def usual_bauds() -> tuple[int, ...]:
-    """Return the speeds of all installed drivers of byte streams, most frequent speed first.
+    """Return the speeds of all installed drivers of byte streams, default speeds first.
 
     Speeds that this system cannot set, such as 128 000 baud, are omitted.
     """

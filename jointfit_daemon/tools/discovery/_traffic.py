@@ -127,7 +127,7 @@ def decode_frames(
     *,
     layouts: Layouts | None = None,
 ) -> Iterator[DecodedDevice]:
-    """Yield the sensors that the installed drivers decode; sensors share no identifier.
+    """Yield the sensors that the installed drivers decode; each identifier belongs to one sensor.
 
     Parameters
     ----------

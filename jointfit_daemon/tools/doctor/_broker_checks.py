@@ -20,7 +20,7 @@ _STORED_S = 1.0
 
 
 async def check_broker(settings: MqttSettings) -> list[Finding]:
-    """Return the findings about the broker; the check has a client id of its own."""
+    """Return the findings about the broker; the check uses its own client id."""
     address = f"{settings.host}:{settings.tcp_port}"
     missing = missing_files(settings)
     findings = [
@@ -38,7 +38,7 @@ async def check_broker(settings: MqttSettings) -> list[Finding]:
     identifier = topics.client_identifier(settings.base)
     if state == "online":
         text = f"a daemon is connected with the client id {identifier!r}"
-        remedy = "stop it before another one with the same base starts, or set another base"
+        remedy = "stop it before another daemon with the same base starts, or set another base"
         findings.append(Finding(CHECK, address, "note", text, remedy))
     if not missing:
         findings.append(Finding(CHECK, address, "ok", "reachable, and accepts the credentials"))

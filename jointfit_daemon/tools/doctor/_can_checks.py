@@ -31,7 +31,9 @@ def check_can(host: Host, bitrates: Mapping[str, int | None] | None) -> Iterator
     """
     found = {interface.name: interface for interface in find_can_interfaces(host.root, host.run)}
     if bitrates is None and not found:
-        yield Finding(CHECK, "", "note", "no CAN interface", "plug one in, if the rig has any")
+        yield Finding(
+            CHECK, "", "note", "no CAN interface", "connect an adapter, if the rig uses CAN"
+        )
 
     for name in found if bitrates is None else bitrates:
         bitrate = None if bitrates is None else bitrates[name]
@@ -60,7 +62,7 @@ def _check_interface(interface: CanInterface, wanted: int | None) -> Iterator[Fi
     if is_virtual:
         return
     if state is None:
-        text = "state and bit rate cannot be read: `ip` is absent, or has no JSON"
+        text = "state and bit rate cannot be read: `ip` is absent, or prints no JSON"
         yield Finding(CHECK, name, "unknown", text, "sudo apt install iproute2")
         return
 

@@ -24,7 +24,7 @@ def doctor(
     *,
     config: Annotated[
         Path | None,
-        typer.Option(help="Configuration to check. Default: rig.toml, if it is in this folder."),
+        typer.Option(help="Configuration to check. Default: rig.toml, if this folder contains it."),
     ] = None,
     wait_s: Annotated[
         float,
@@ -98,7 +98,7 @@ def examine(
         *of_host.check_disk(host),
         *of_host.check_memory(host),
         *of_host.check_processor(host),
-        Finding("software", "", "ok", f"modules of the frame's path: {running_variant()}"),
+        Finding("software", "", "ok", f"modules that compute each frame: {running_variant()}"),
     ]
     progress(0.2)
     if rig is None:
@@ -127,7 +127,9 @@ async def _diagnose(cameras: Source, wait_s: float) -> list[Finding]:
 
     if not hasattr(cameras.driver_class, "diagnose"):
         text = f"driver {cameras.driver} has no diagnosis: the stream was not checked"
-        return [Finding("mocap", cameras.driver, "unknown", text, "start jointfitd, read its log")]
+        return [
+            Finding("mocap", cameras.driver, "unknown", text, "start jointfitd and read its log")
+        ]
     driver = cast("Diagnosis", cast("Any", cameras.driver_class))
     return await driver.diagnose(cameras.settings, wait_s)
 

@@ -100,13 +100,14 @@ def _compare(  # noqa: PLR0911 - one for each finding
     at = f"{_model(found)} at {heard.baud} baud"
     if not own:
         remedy = (
-            f'set driver = "{found.driver}" and baud = {heard.baud}, or set port to that of the '
-            f"{source.driver} device; lines to copy: jointfit probe --serial {source.settings.port}"
+            f'set driver = "{found.driver}" and baud = {heard.baud}, or set port to the port '
+            f"of the {source.driver} device; lines to copy: jointfit probe --serial "
+            f"{source.settings.port}"
         )
         text = f"the device on this port is {at}, expected {expected}"
         return Finding(CHECK, name, "error", text, remedy)
     if heard.baud != source.settings.baud:
-        text = f"sends as {at}, expected {expected}"
+        text = f"the device is {at}, expected {expected}"
         return Finding(CHECK, name, "error", text, f"set baud = {heard.baud}")
 
     said = "; ".join(found.warnings)
@@ -118,7 +119,7 @@ def _compare(  # noqa: PLR0911 - one for each finding
     if proposed:
         return Finding(CHECK, name, "warning", f"{at}: {said}", f"set {', '.join(proposed)}")
     if found.samples < LEAST_SAMPLES:
-        said = said or "the daemon configures it when it opens the port"
+        said = said or "the daemon configures the device when it opens the port"
         return Finding(CHECK, name, "note", f"{at} sends no orientation: {said}")
     if found.warnings:
         remedy = "correct this, then run `jointfit doctor` again"

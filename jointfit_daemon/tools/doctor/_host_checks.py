@@ -57,7 +57,7 @@ def check_disk(host: Host) -> Iterator[Finding]:
         if free < LOW_DISK_BYTES:
             level = "error" if free < LEAST_DISK_BYTES else "warning"
             remedy = f"delete old recordings: du -sh {folder}/*"
-            yield Finding("disk", str(folder), level, f"{text}, expected 1 GB", remedy)  # type: ignore[arg-type]  # two literals
+            yield Finding("disk", str(folder), level, f"{text}, expected at least 1 GB", remedy)  # type: ignore[arg-type]  # two literals
         else:
             yield Finding("disk", str(folder), "ok", text)
 
@@ -72,7 +72,7 @@ def check_memory(host: Host) -> Iterator[Finding]:
     text = f"{available // 1000} MB available"
     if available < LOW_MEMORY_KB:
         remedy = "stop other programs: ps -eo rss,comm --sort -rss | head"
-        yield Finding("memory", "", "warning", f"{text}, expected 200 MB", remedy)
+        yield Finding("memory", "", "warning", f"{text}, expected at least 200 MB", remedy)
     else:
         yield Finding("memory", "", "ok", text)
 

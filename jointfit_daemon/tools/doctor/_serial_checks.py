@@ -38,7 +38,9 @@ def check_serial(host: Host, paths: Sequence[str] | None) -> Iterator[Finding]:
     ports = find_serial_ports(host.root)
     checked = [port.path for port in ports if port.vendor_id is not None]
     if paths is None and not checked:
-        yield Finding(CHECK, "", "note", "no USB serial adapter", "plug one in, if the rig has any")
+        yield Finding(
+            CHECK, "", "note", "no USB serial adapter", "connect an adapter, if the rig uses one"
+        )
     for path in dict.fromkeys(checked if paths is None else paths):
         found = list(_check_port(host, path, ports))
         yield from found
@@ -67,8 +69,10 @@ def _check_port(host: Host, path: str, ports: Sequence[SerialPortInfo]) -> Itera
             text = f"in use by {program} (process {number}), as expected while the daemon runs"
             yield Finding(CHECK, path, "note", text)
         else:
-            text = f"in use by {program} (process {number}), which reads its bytes or locks it"
-            yield Finding(CHECK, path, "error", text, f"close it: kill {number}")
+            text = (
+                f"in use by {program} (process {number}), which reads bytes of the port or locks it"
+            )
+            yield Finding(CHECK, path, "error", text, f"close this program: kill {number}")
     if name.startswith(_MODEM_PORTS) and _is_probed(host, name):
         yield Finding(
             CHECK, path, "warning", "ModemManager runs, and may open the port when it appears",

@@ -77,11 +77,17 @@ Lengths = Annotated[
     list[str] | None,
     typer.Option(
         "--length",
-        help="SEGMENT=METRES: distance between its joint centers; repeatable. Needed for joint"
-        " positions.",
+        help="SEGMENT=METRES: distance between the joint centers of the segment; repeatable."
+        " Needed for joint positions.",
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object in SI units.")]
+Left = Annotated[
+    bool,
+    typer.Option(
+        "--left", help="The limb is a left limb; sets the signs of adduction and rotation."
+    ),
+]
 
 
 @app.command()
@@ -94,7 +100,10 @@ def evaluate(
     markers: Markers = None,
     up: Up = "z",
     holdout: Annotated[
-        float, typer.Option("--holdout", min=0.1, max=0.9, help="Held-out share of a single trial.")
+        float,
+        typer.Option(
+            "--holdout", min=0.1, max=0.9, help="Held-out share if there is only one trial."
+        ),
     ] = 0.4,
     json: Json = False,
     plot: Annotated[
@@ -182,19 +191,19 @@ def fit(
 
 @app.command()
 def apply(
-    model: Annotated[Path, typer.Argument(help="Model of `fit`, or stored calibration.")],
-    sensors: Annotated[Path, typer.Argument(help="Sensors: .npz or .sto.")],
+    model: Annotated[Path, typer.Argument(help="Model written by `fit`, or stored calibration.")],
+    sensors: Annotated[Path, typer.Argument(help="Sensor file, .npz or .sto.")],
     *,
     out: Annotated[
         Path,
-        typer.Option("--out", help="Orientations, angles, positions: .sto, .mot, .npz or .csv."),
+        typer.Option(
+            "--out", help="File for orientations, angles and positions: .sto, .mot, .npz or .csv."
+        ),
     ],
     without: Annotated[
         list[str] | None, typer.Option("--without", help="Sensor to ignore; repeatable.")
     ] = None,
-    left: Annotated[
-        bool, typer.Option("--left", help="Left limb (signs of adduction, rotation).")
-    ] = False,
+    left: Left = False,
     up: Up = "z",
     length: Lengths = None,
     origin: Annotated[

@@ -51,7 +51,9 @@ def parse_lengths(texts: Sequence[str], segments: Sequence[str]) -> dict[str, fl
         name, equals, value = text.partition("=")
         length = _number(value)
         if not equals or length is None:
-            raise UnusableInputError(f"--length {text!r}: expected SEGMENT=METRES, as thigh=0.42")
+            raise UnusableInputError(
+                f"--length {text!r}: expected SEGMENT=METRES, such as thigh=0.42"
+            )
         if name not in segments:
             problem = unknown_name("segment", name, segments)
             raise UnusableInputError(f"--length {text!r}: {problem}")
@@ -80,7 +82,7 @@ def parse_origin(text: str | None) -> Vector | None:
     known = [number for number in numbers if number is not None]
     if len(numbers) != _COORDINATES or len(known) != _COORDINATES:
         raise UnusableInputError(
-            f"--origin {text!r}: expected X,Y,Z of the first joint in metres, z up, as 0,0,0.9"
+            f"--origin {text!r}: expected X,Y,Z of the first joint in metres, z up, such as 0,0,0.9"
         )
     return known[0], known[1], known[2]
 

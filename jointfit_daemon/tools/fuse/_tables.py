@@ -148,7 +148,8 @@ def select_references(
     if missing := [name for name in names if name not in table.bones]:
         problems = [unknown_name("reference of segment", name, table.bones) for name in missing]
         raise UnusableInputError(
-            f"{path}: {'; '.join(problems)}; if another file has it, write SENSORS=REFERENCE; if"
-            " its name differs, --segment NAME=SENSORS:BONE; if there is none, omit the trial"
+            f"{path}: {'; '.join(problems)}; if another file contains the reference, write"
+            " SENSORS=REFERENCE; if the reference has another name, write --segment"
+            " NAME=SENSORS:BONE; if there is no reference, omit the trial"
         )
     return {name: table.bones[name] for name in names}

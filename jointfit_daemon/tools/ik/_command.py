@@ -17,11 +17,15 @@ Trial = Annotated[Path, typer.Argument(help="Marker trial, .trc or .c3d.")]
 Model = Annotated[Path, typer.Argument(help="Chain model: .osim, .toml, .json.")]
 Out = Annotated[
     list[Path] | None,
-    typer.Option("--out", help="Coordinates: .mot or .sto (OpenSim), .csv. Repeatable."),
+    typer.Option(
+        "--out", help="File for the coordinates: .mot or .sto (OpenSim), .csv. Repeatable."
+    ),
 ]
 Errors = Annotated[
     Path | None,
-    typer.Option("--errors", help="RMS and largest marker error per frame: .sto, .mot, .csv."),
+    typer.Option(
+        "--errors", help="File for RMS and largest marker error per frame: .sto, .mot, .csv."
+    ),
 ]
 Weight = Annotated[
     list[str] | None,
@@ -29,23 +33,27 @@ Weight = Annotated[
 ]
 Setup = Annotated[
     Path | None,
-    typer.Option("--setup", help="Marker weights and time range of an OpenSim IK set-up file."),
+    typer.Option(
+        "--setup", help="OpenSim IK set-up file; its marker weights and time range are used."
+    ),
 ]
 Without = Annotated[
     list[str] | None,
     typer.Option("--without", help="Ignore marker NAME, for example a computed point. Repeatable."),
 ]
-Start = Annotated[float | None, typer.Option("--start", help="First time, s.")]
-End = Annotated[float | None, typer.Option("--end", help="Last time, s.")]
+Start = Annotated[float | None, typer.Option("--start", help="Time of the first frame, s.")]
+End = Annotated[float | None, typer.Option("--end", help="Time of the last frame, s.")]
 Limits = Annotated[
-    bool, typer.Option("--limits/--no-limits", help="Restrict joints to the model's limits.")
+    bool,
+    typer.Option("--limits/--no-limits", help="Restrict coordinates to the limits of the model."),
 ]
 Sd = Annotated[
     bool, typer.Option("--sd", help="Add a column NAME_sd: standard deviation of a coordinate.")
 ]
 Radians = Annotated[bool, typer.Option("--radians", help="Write radians instead of degrees.")]
 Up = Annotated[
-    str | None, typer.Option("--up", help="Vertical axis, if the file does not define it.")
+    str | None,
+    typer.Option("--up", help="Vertical axis x, y or z, if the file does not define it."),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object in SI units.")]
 
@@ -69,9 +77,9 @@ def ik(
 ) -> None:
     """Compute the joint coordinates of a marker trial by inverse kinematics.
 
-    Compares the marker errors with the limits that OpenSim recommends, and exits with 0 even if
-    they are larger. Exits with 1 if the trial cannot be of the model (other markers, unit or
-    size), or if no frame of a .mot or .sto file is complete.
+    The command compares the marker errors with the limits that OpenSim recommends. Errors above
+    these limits do not change the exit code. The exit code is 1 if the trial does not belong to the
+    model (other markers, unit or size), or if no frame of a .mot or .sto file is complete.
     """
     from jointfit_daemon.calibration.marker_refinement import RefinementError
     from jointfit_daemon.tools.ik._output import ENDINGS, write_tables

@@ -150,7 +150,7 @@ def solve_trial(asked: IkRequest) -> TrialSolution:
     rms = float(np.sqrt(np.nanmean(square)))
     if rms > MOST_RMS_M:
         raise RefinementError(
-            f"{motion.name}: the model is {1000 * rms:.0f} mm RMS off its markers, expected less"
+            f"{motion.name}: the markers are {1000 * rms:.0f} mm RMS from the model, expected less"
             f" than {1000 * MOST_RMS_M:.0f} mm: check labels, scaling and axes (--up)"
             + "".join(f"; {note}" for note in remarks)
         )
@@ -247,7 +247,7 @@ def _trial_solution(
         )
     never = [name for name, some in zip(table.names, ever, strict=True) if not some]
     if never:
-        notes.append(f"omitted, because no markers determine them: {list_names(never)}")
+        notes.append(f"coordinates omitted, because no markers determine them: {list_names(never)}")
 
     tracked = seen.any(axis=0)
     return TrialSolution(

@@ -38,7 +38,7 @@ def read_answers(path: Path) -> Answers:
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: no answer file: {error}: expected TOML in UTF-8") from error
+        raise ValueError(f"{path}: invalid answer file: {error}: expected TOML in UTF-8") from error
     answers: Answers = {}
     for key, value in table.items():
         if isinstance(value, dict):

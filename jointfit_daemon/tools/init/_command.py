@@ -36,27 +36,28 @@ def init(
     answers: Annotated[
         Path | None,
         typer.Option(
-            "--answers", help="TOML file with answers; the proposal replaces a missing one."
+            "--answers", help="TOML file with answers; a missing answer takes the proposed value."
         ),
     ] = None,
     port: Annotated[
         list[Path] | None,
-        typer.Option("--port", help="Further serial port for the list; repeatable."),
+        typer.Option("--port", help="Additional serial port for the list of devices; repeatable."),
     ] = None,
     network: Annotated[
         bool, typer.Option(help="Search the network for motion-capture servers.")
     ] = True,
     restart: Annotated[
-        bool, typer.Option("--restart", help="Forget the answers of an interrupted dialogue.")
+        bool, typer.Option("--restart", help="Discard the answers of an interrupted dialogue.")
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing rig.toml.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Ask for limb, sensors, cameras and broker, and write a checked rig.toml.
 
-    Found devices are listed; Enter takes the proposal. Without a terminal, the lines of standard
-    input are the answers. An interrupted dialogue continues at the next start. Exit codes: 0 the
-    file is written; 2 it exists, cannot be written, or an answer is missing; 130 interrupted.
+    The command lists the devices that it finds. The Enter key takes the proposed answer. Without a
+    terminal, the lines of standard input are the answers. An interrupted dialogue continues at the
+    next start. Exit codes: 0 the file is written; 2 the file exists or cannot be written, or an
+    answer is missing; 130 interrupted.
     """
     from jointfit_daemon.tools.init._writing import state_of, write_rig
 
@@ -173,7 +174,7 @@ def _show_found(dialogue: Dialogue, show: Callable[[str], None]) -> None:
     devices = (*found.ports, *found.interfaces, *found.servers)
     if not devices:
         show("No serial port, CAN interface or motion-capture server was found.")
-        show("You may type their names, or connect them and start again.")
+        show("You may type the names of devices, or connect devices and start again.")
         return
     show("Found devices:")
     width = max(len(each.address) for each in devices)

@@ -172,7 +172,7 @@ class Dialogue:
         width = max((len(choice.address) for choice in asked.choices), default=0)
         if asked.question.kind == "ids":
             names = " ".join(each.address for each in asked.choices)
-            self.show(f"  {names}, as {' '.join(each.text for each in asked.choices)}")
+            self.show(f"  {names}, such as {' '.join(each.text for each in asked.choices)}")
         else:
             for number, choice in enumerate(asked.choices, 1):
                 self.show(f"  {number}  {choice.address:{width}}  {choice.text}".rstrip())
@@ -181,8 +181,10 @@ class Dialogue:
             line = self.read_line(self._prompt(asked)).strip()
             if line == HELP:
                 self.show(f"  {asked.help}")
-                proposal = "Enter takes the proposal in brackets, "
-                self.show(f"  {proposal if answer_text(asked.proposal) else ''}'<' returns.")
+                keys = "'<' goes back one question."
+                if answer_text(asked.proposal):
+                    keys = f"Enter takes the proposal in brackets, {keys}"
+                self.show(f"  {keys}")
                 continue
             if line == BACK:
                 self.go_back()
@@ -221,7 +223,9 @@ class Dialogue:
         if asked.question.finder == "stream":
             self._read_stream()
             if not self.found.markers:
-                raise AnswerError("no names of markers: type them, separated by commas")
+                raise AnswerError(
+                    "the stream has no marker names: type the names, separated by commas"
+                )
             return
 
         if asked.question.finder == "traffic":

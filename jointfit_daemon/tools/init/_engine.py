@@ -161,8 +161,8 @@ def accept(asked: Asked, given: Any, answers: Mapping[Key, Any], found: Found) -
     if asked.question.kind == "device" and value != LATER:
         if _PORT_WITHOUT_FOLDER.fullmatch(value):
             raise AnswerError(
-                f"found {value!r}, expected the path of a serial port, as /dev/{value}, or the"
-                " name of a CAN interface, as can0"
+                f"found {value!r}, expected the path of a serial port, such as /dev/{value}, or"
+                " the name of a CAN interface, such as can0"
             )
         if not drivers_for(extended, found, asked.subject):
             wiring = wiring_of(extended, value)

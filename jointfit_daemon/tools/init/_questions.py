@@ -127,14 +127,15 @@ QUESTIONS: tuple[Question, ...] = (
         "name",
         "text",
         "Name of the rig",
-        "It becomes part of every MQTT topic. Letters of any script are allowed, / + # are not.",
+        "It becomes part of every MQTT topic. Letters of any script are allowed, but not the"
+        " characters / + #.",
         default=_always("bench-1"),
     ),
     Question(
         "limb",
         "choice",
         "Limb",
-        "Segments and joints of the rig. Other limbs: see the documentation of rig.toml.",
+        "Segments and joints of the rig. For other limbs, see the documentation of rig.toml.",
         default=_always("knee"),
         choices=_limbs,
     ),
@@ -151,7 +152,7 @@ QUESTIONS: tuple[Question, ...] = (
         "subject",
         "text",
         "Name of the subject's calibrations",
-        "Folder of the stored calibrations: letters, digits, . _ and -.",
+        "Name of the folder for the calibrations, from letters, digits, and the characters . _ -",
         default=_always("subject-1"),
     ),
     Question(
@@ -173,8 +174,8 @@ QUESTIONS: tuple[Question, ...] = (
         "sensors",
         "names",
         "Sensors on the {subject}",
-        "Names of the sensors, separated by commas. Two sensors per segment reduce the error of"
-        " soft tissue; one is enough. The names become MQTT topics.",
+        "Names of the sensors, separated by commas. Two sensors per segment reduce the error that"
+        " soft tissue causes; one sensor is enough. The names become MQTT topics.",
         subjects=lambda answers, _: limb_of(answers).segments if _has_sensors(answers) else (),
         default=_proposals.sensors,
     ),
@@ -200,7 +201,7 @@ QUESTIONS: tuple[Question, ...] = (
         "device",
         "Connection of the sensor {subject}",
         "A number of the list, the path of a serial port, or a CAN interface. 'find' detects the"
-        " sensor by its movement: it opens the free ports and buses of the list. If it is"
+        " sensor by its movement: it opens the free ports and buses of the list. If the sensor is"
         " not connected yet, answer 'later': rig.toml then contains this word.",
         group="sensor",
         postponable=True,
@@ -214,7 +215,7 @@ QUESTIONS: tuple[Question, ...] = (
         "driver",
         "choice",
         "Driver of the sensor {subject}",
-        "Several installed drivers read this connection. 'find' receives on the serial port or"
+        "Several installed drivers can read this connection. 'find' receives on the serial port or"
         " CAN interface, without sending, and proposes the driver that decodes the data.",
         group="sensor",
         subjects=lambda answers, found: tuple(
@@ -274,7 +275,7 @@ QUESTIONS: tuple[Question, ...] = (
         choices=_identifiers,
         finder="identifiers",
         explain=lambda answers, found, sensor: (
-            f"{', '.join(driver_of(answers, found, sensor).ids)}, as "
+            f"{', '.join(driver_of(answers, found, sensor).ids)}, such as "
             f"{' '.join(each.text for each in _identifiers(answers, found, sensor))}. {_IDS_HELP}"
         ),
     ),
@@ -282,10 +283,10 @@ QUESTIONS: tuple[Question, ...] = (
         "layout",
         "text",
         "File with the layout of the data of the sensor {subject}",
-        "TOML file with the keys of its [[imu]] table that describe its frames or lines: `frame` or"
-        " `text`, `ids`, `dbc` and `fields`. The pages on serial-table and can-table in the"
-        " documentation have examples; a rig.toml with such a table is accepted, too. A DBC file"
-        " is named by its key `dbc`.",
+        "TOML file with the keys of the [[imu]] table that describe the frames or lines of the"
+        " sensor: `frame` or `text`, `ids`, `dbc` and `fields`. The key `dbc` names a DBC file. The"
+        " pages on serial-table and can-table in the documentation have examples. A rig.toml with"
+        " such a table is accepted, too.",
         subjects=lambda answers, found: tuple(
             name
             for name in sensors_of(answers)
@@ -334,7 +335,7 @@ QUESTIONS: tuple[Question, ...] = (
         "Markers on the {subject}",
         "Names in the stream, separated by commas: at least three that are not on one line."
         " 'find' reads the names from the stream. Answer 'later' if they are not known yet. Body"
-        " parts that are not segments may have none.",
+        " parts that are not segments may have no markers.",
         postponable=True,
         subjects=lambda answers, _: marked_parts(answers),
         default=_proposals.markers,
@@ -370,8 +371,8 @@ QUESTIONS: tuple[Question, ...] = (
         "length_m",
         "number",
         "Length of the {subject} (m)",
-        "From joint to joint. Without a length, positions below the segment are unknown; angles"
-        " do not need it.",
+        "Distance from joint to joint. Without it, the positions of the joints below the segment"
+        " are unknown. Joint angles do not depend on it.",
         subjects=lambda answers, _: lengths_asked(answers),
         default=lambda answers, _, segment: limb_of(answers).lengths_m.get(segment),
         optional=True,
@@ -380,7 +381,8 @@ QUESTIONS: tuple[Question, ...] = (
         "broker",
         "address",
         "MQTT broker",
-        "Name or address, with :PORT if it is not the usual one.",
+        "Name or address of the computer of the broker, with :PORT if the port is not the usual"
+        " one.",
         default=_always("127.0.0.1"),
     ),
     Question(
@@ -415,7 +417,7 @@ QUESTIONS: tuple[Question, ...] = (
         "password_file",
         "text",
         "File for the password",
-        "The password is in a file of its own, readable by its owner only, never in the rig.",
+        "The password is in a separate file that only its owner can read, never in rig.toml.",
         subjects=_if(lambda answers: answers["username", ""] is not None),
         default=_always("mqtt-password"),
     ),

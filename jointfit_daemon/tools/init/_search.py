@@ -286,12 +286,12 @@ class DeviceSearch:
         """
         if "/" in bus:
             raise AnswerError(
-                f"{bus} is a serial adapter, which is not searched: type the identifiers, as the"
-                " vendor's program shows them"
+                f"{bus} is a serial adapter, which is not searched: type the identifiers that the"
+                " vendor's program shows"
             )
         sensors = tuple(self._sensors_on(found, bus))
         if not sensors:
-            raise AnswerError(f"{bus}: no sensor was received: check its power and the bit rate")
+            raise AnswerError(f"{bus}: no data of a sensor were received: check power and bit rate")
         return replace(found, can_sensors={**found.can_sensors, bus: sensors})
 
     def _sensors_on(self, found: Found, bus: str) -> list[CanSensor]:

@@ -25,11 +25,11 @@ Trials = Annotated[list[Path], typer.Argument(help="Training trials, .trc or .c3
 Model = Annotated[Path, typer.Option("--model", help="Chain model: .toml, .json, .osim.")]
 Lock = Annotated[
     list[str] | None,
-    typer.Option("--lock", help="Lock marker NAME, or one coordinate: NAME.x. Repeatable."),
+    typer.Option("--lock", help="Lock marker NAME, or one coordinate, such as NAME.x. Repeatable."),
 ]
 Unlock = Annotated[
     list[str] | None,
-    typer.Option("--unlock", help="Unlock marker NAME; '*' unlocks all. Repeatable."),
+    typer.Option("--unlock", help="Unlock marker NAME; '*' unlocks all markers. Repeatable."),
 ]
 Without = Annotated[
     list[str] | None,
@@ -37,18 +37,22 @@ Without = Annotated[
 ]
 Validate = Annotated[
     list[Path] | None,
-    typer.Option("--validate", help="Validation trial, not used in the fit. Repeatable."),
+    typer.Option("--validate", help="Validation trial, which the fit does not use. Repeatable."),
 ]
 Method = Annotated[
-    str, typer.Option("--method", help="joint (all at once), block, or search (slow).")
+    str,
+    typer.Option(
+        "--method", help="joint (markers and poses at once), block (in turns), or search (slow)."
+    ),
 ]
 Prior = Annotated[
-    float, typer.Option("--prior", min=0.0, help="Cost of displacement relative to tracking error.")
+    float,
+    typer.Option("--prior", min=0.0, help="Cost of a displacement relative to the tracking error."),
 ]
 Cost = Annotated[
     str,
     typer.Option(
-        "--cost", help="l2: squared errors; l1: distances, less influence of large errors."
+        "--cost", help="l2: squared errors; l1: distances, so large errors have less influence."
     ),
 ]
 Weights = Annotated[
@@ -58,7 +62,7 @@ Weights = Annotated[
 Evenness = Annotated[
     float,
     typer.Option(
-        "--evenness", min=0.0, max=8.0, help="Weight of a trial: its error to this power."
+        "--evenness", min=0.0, max=8.0, help="Each trial is weighted by its error to this power."
     ),
 ]
 Holdout = Annotated[
@@ -67,7 +71,7 @@ Holdout = Annotated[
         "--holdout",
         min=0.0,
         max=0.5,
-        help="Share at the end of each trial that decides when to stop.",
+        help="Share at the end of each trial that is not fitted and decides when the fit stops.",
     ),
 ]
 Frames = Annotated[
@@ -81,11 +85,14 @@ Threshold = Annotated[
     typer.Option("--threshold", help="Step at which the search ends, mm.", min=0.001, max=100.0),
 ]
 Up = Annotated[
-    str | None, typer.Option("--up", help="Vertical axis, if the files do not define it.")
+    str | None, typer.Option("--up", help="Vertical axis x, y or z, if the files do not define it.")
 ]
 Out = Annotated[
     list[Path] | None,
-    typer.Option("--out", help=".toml/.json model, .xml marker set, .trc offsets. Repeatable."),
+    typer.Option(
+        "--out",
+        help="Output file: .toml or .json model, .xml marker set, .trc offsets. Repeatable.",
+    ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object in SI units.")]
 Plot = Annotated[Path | None, typer.Option("--plot", help="Plot the result: .png, .svg or .pdf.")]

@@ -45,7 +45,7 @@ def present() -> Moment:
 
 
 class MonitorApp(App[int]):
-    """The monitor.
+    """Textual program of the monitor.
 
     A key changes the state at once. The screen changes at the next update, so no sequence of keys
     or messages causes more than `updates_hz` updates per second.

@@ -33,7 +33,7 @@ _WIDE = 66
 """Smallest width at which the joint centres are a table, cells."""
 _STEPS = (
     ("align", "a", "Align the sensors", True,
-     "Fix all sensors to the plate. Turn it about all three axes until the time is over."),
+     "Fix all sensors to the plate. Turn the plate about all three axes until the time is over."),
     ("static", "s", "Stand still", False,
      "Put on all sensors and markers. Stand upright and still, with straight joints."),
     ("functional", "f", "Move every joint", True,
@@ -135,7 +135,11 @@ def _result(calibration: CalibrationState, width: int) -> list[Line]:
         lines = wrap(f"✖ {calibration_sentence(calibration)}", width, "error", indent=2)
     if calibration.kept:
         lines += wrap(f"✖ Rejected: {calibration.kept}", width, "error", indent=2)
-        lines += wrap("Key F repeats the movement and accepts a worse result.", width, "muted")
+        lines += wrap(
+            "Key F repeats the movement and accepts its result, even if it is worse.",
+            width,
+            "muted",
+        )
     quality = calibration.quality
     try:
         texts = report(quality)
@@ -183,7 +187,7 @@ def history_lines(state: MonitorState, width: int) -> list[Line]:
     if not wide and chosen is not None:
         lines += wrap(f"Version {chosen.version}: {_errors(chosen)}", width, "muted")
     if stored.omitted:
-        lines += wrap(f"{stored.omitted} older: jointfit calibrate --list", width, "muted")
+        lines += wrap(f"{stored.omitted} older versions: jointfit calibrate --list", width, "muted")
     return lines
 
 

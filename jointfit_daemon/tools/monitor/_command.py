@@ -37,20 +37,23 @@ _Rig = Annotated[
     Path | None,
     typer.Option(
         help="rig.toml with the broker, its account and the request key. Default: rig.toml of the"
-        " present folder, if it exists and no broker option is given."
+        " current folder, if it exists and no broker option is given."
     ),
 ]
 _Broker = Annotated[
     str | None,
     typer.Option(
-        help="mqtt://HOST:PORT, or mqtts://HOST:PORT with TLS. Default: mqtt://localhost:1883."
+        help="Broker: mqtt://HOST:PORT, or mqtts://HOST:PORT (TLS). Default: mqtt://localhost:1883."
     ),
 ]
 _Base = Annotated[
     str | None, typer.Option(help="Base topic of the rig. Default: the monitor finds it.")
 ]
 _Ca = Annotated[
-    Path | None, typer.Option(help="Certificate of the broker's authority, for mqtts://.")
+    Path | None,
+    typer.Option(
+        help="Certificate of the authority that signed the broker's certificate (mqtts://)."
+    ),
 ]
 _User = Annotated[str | None, typer.Option(help="User name for the broker.")]
 _PasswordFile = Annotated[Path | None, typer.Option(help="File with the password of --user.")]
@@ -73,10 +76,10 @@ def monitor(
 ) -> None:
     """Show limb, joint angles, sensors and calibration in a terminal, also over ssh.
 
-    Keys are shown in the last line; q or Ctrl-C ends the monitor. It reconnects when the daemon or
-    the broker is lost, and shows which of them was lost. Colours follow NO_COLOR. Exit codes: 0
-    ended by a key; 2 invalid options or rig.toml, no terminal, or a missing package; 128 + N
-    stopped by signal N.
+    The last line shows the keys; q or Ctrl-C ends the monitor. If the daemon or the broker is lost,
+    the monitor shows which of them was lost, and reconnects. The environment variable NO_COLOR
+    turns colours off. Exit codes: 0 ended by a key; 2 invalid options or rig.toml, no terminal, or
+    a missing package; 128 + N stopped by signal N.
     """
     options = (broker, ca, user, password_file, request_key_file)
     if rig is not None and any(option is not None for option in options):

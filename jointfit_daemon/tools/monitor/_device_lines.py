@@ -70,7 +70,7 @@ def _summary(rig: RigView, name: str, now: Moment) -> DeviceSummary:
         (silent, "error", "No data: check cable, power"),
         (availability != "online", "muted", "Waiting"),
         (stuck, "error", "Stuck, repeats its value: restart it"),
-        (f"slipped:{name}" in flags, "error", "Slipped on the body: fix it"),
+        (f"slipped:{name}" in flags, "error", "Slipped on the body: fasten it"),
         (_is_slow(rig, name, counts), "warning", "Slower than the output rate"),
     )
     level, state = next(

@@ -56,7 +56,7 @@ class DotCanvas:
             self._masks[y][x] = 1
 
     def line(self, start: tuple[int, int], end: tuple[int, int], *, every: int = 1) -> None:
-        """Set the dots of a straight line, or one of `every` dots."""
+        """Draw a straight line; `every` is the distance of the drawn dots, in dots."""
         (x0, y0), (x1, y1) = start, end
         steps = max(abs(x1 - x0), abs(y1 - y0), 1)
         if steps > 4 * (self.width + self.height):

@@ -35,7 +35,7 @@ _WITH_SD = ("flexion_deg", "elevation_deg", "inner_deg")
 
 
 def pose_age_s(rig: RigView, now: Moment) -> float | None:
-    """Return the time since the last pose, s; None before the first one."""
+    """Return the time since the last pose, s; None before the first pose."""
     return None if rig.pose_s is None else now.monotonic_s - rig.pose_s
 
 
@@ -107,8 +107,8 @@ def _no_pose(rig: RigView, width: int) -> list[Line]:
         ]
     else:
         text = (
-            "Waiting for the first pose (pose/ui). If none comes: the account cannot read it, or"
-            " pose_ui_hz is low."
+            "Waiting for the first pose (pose/ui). If no pose arrives, the account cannot read"
+            " this topic, or pose_ui_hz is low."
         )
     return wrap(text, width, "muted")
 

@@ -162,8 +162,8 @@ class RigView:
         _append(self.poses, _angles(pose))
         self._extend_reach(pose)
 
-        # The smallest difference between time stamp and time of receipt converts the time of this
-        # machine to gateway time.
+        # The smallest delay between time stamp and receipt determines the conversion of the time of
+        # this machine to gateway time.
         offset_us = pose.t_us - now.monotonic_s * 1e6
         if self.clock_offset_us is None or offset_us > self.clock_offset_us:
             self.clock_offset_us = offset_us

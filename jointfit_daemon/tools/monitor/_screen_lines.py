@@ -48,8 +48,8 @@ _EVENT_LEVELS: dict[NoticeLevel, Level] = {
     NoticeLevel.ERROR: "error",
 }
 _STOPPED = (
-    "jointfitd stopped or lost its broker. The monitor continues when it is back. Check it with:"
-    " systemctl status jointfitd"
+    "jointfitd stopped or lost its broker. The monitor continues when jointfitd is back. Check it"
+    " with: systemctl status jointfitd"
 )
 
 
@@ -204,8 +204,7 @@ def _waiting_lines(state: MonitorState, width: int) -> list[Line]:
         Line.of("  jointfitd --config rig.toml", "imu"),
         *wrap(
             "If the daemon runs: host and port under [mqtt] of its rig.toml must be those of this"
-            " broker,"
-            " and this account must have the right to read its topics.",
+            " broker, and this account must have the right to read the topics of the rig.",
             width,
             "muted",
         ),

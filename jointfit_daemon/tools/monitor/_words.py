@@ -1,7 +1,7 @@
 """Conversion of numbers, ages, states and flags to text.
 
-An unknown value is ``–``, never 0 and never an old value. The web page of the dashboard has the
-same texts (``page/js/words.js``).
+An unknown value is ``–``, never 0 and never an old value. The web page of the dashboard has
+similar texts (``page/js/words.js``).
 """
 
 from __future__ import annotations

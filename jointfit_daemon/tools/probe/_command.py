@@ -43,11 +43,12 @@ _Mocap = Annotated[
 _PhysicalTest = Annotated[
     str | None,
     typer.Option(
-        help="Sensor of rig.toml to test by three rotations, ID; the daemon must be stopped."
+        help="Test the sensor with this id in rig.toml by three rotations; stop the daemon first."
     ),
 ]
 _Config = Annotated[
-    Path, typer.Option(help="Rig of the sensor for --physical-test, and of layouts to try.")
+    Path,
+    typer.Option(help="rig.toml with the sensor for --physical-test, and with layouts to try."),
 ]
 _Step = Annotated[
     float, typer.Option("--step", help="Longest time for a rotation, s.", min=2.0, max=600.0)
@@ -61,11 +62,15 @@ def probe(
     mocap: _Mocap = None,
     network: Annotated[
         bool,
-        typer.Option("--network", help="Search the network for servers by one broadcast."),
+        typer.Option(
+            "--network", help="Search the network for motion-capture servers by one broadcast."
+        ),
     ] = False,
     listen_s: Annotated[
         float,
-        typer.Option("--listen", help="Time at each speed and interface, s.", min=0.1, max=60.0),
+        typer.Option(
+            "--listen", help="Listening time at each speed and interface, s.", min=0.1, max=60.0
+        ),
     ] = 1.0,
     physical_test: _PhysicalTest = None,
     config: _Config = Path("rig.toml"),
@@ -75,17 +80,17 @@ def probe(
     """List serial ports, CAN interfaces and motion-capture servers; listen where requested.
 
     The command opens only the named ports, interfaces and hosts, and changes no setting of a
-    device. A port is read at the usual speeds of the installed drivers until a driver decodes the
-    data; layouts of serial-table and can-table in rig.toml are tried, too. Lines for rig.toml are
-    printed. With --physical-test, the command opens the sensor as the daemon does, guides the user
-    through three rotations, and prints the corrections. Exit codes: 0 every named device was
-    recognized, or the configured frames are correct; 1 a device was not recognized, or the frames
-    are wrong; 2 invalid options.
+    device. It reads a port at the usual speeds of the installed drivers until a driver decodes the
+    data; layouts of serial-table and can-table in rig.toml are tried, too. Then it prints lines for
+    rig.toml. With --physical-test, the command opens the sensor as the daemon does, guides you
+    through three rotations, and prints corrections of the coordinate frames in rig.toml. Exit
+    codes: 0 every named device was recognized, or the frames are correct; 1 a device was not
+    recognized, or the frames are wrong; 2 invalid options.
     """
     if physical_test is not None:
         if serial or can or mocap or network:
             raise ValueError(
-                "--physical-test takes the port from rig.toml: leave out other devices"
+                "--physical-test takes the port from rig.toml: omit the options for other devices"
             )
         _test_by_hand(physical_test, config, step_s, json=json)
         return
@@ -238,7 +243,7 @@ async def _servers(
 _NETWORK = "--network"
 _CARDS = "check the network cards"
 _REMEDIES = {
-    True: "start its streaming, check address, port and firewall (`jointfit doctor --config "
+    True: "start the streaming, check address, port and firewall (`jointfit doctor --config "
     "rig.toml` names the cause)",
     False: "routers and firewalls stop broadcasts; name the server with --mocap HOST",
 }
@@ -262,7 +267,7 @@ def _faults(
             faults.append(
                 f"{port.port}: {sum(port.received_bytes.values())} bytes, but no installed driver "
                 "decodes them: check the speed of the device, or describe its data by a "
-                "serial-table in rig.toml and repeat this with --config"
+                "serial-table in rig.toml and repeat the command with --config"
             )
 
     for bus in can:

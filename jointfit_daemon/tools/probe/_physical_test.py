@@ -24,7 +24,7 @@ speeds."""
 
 
 class PhysicalTestError(Exception):
-    """The device was lost or misconfigured, sent no orientation, or had no new rest in time."""
+    """The device is lost or misconfigured, sends no orientation, or a rotation took too long."""
 
 
 async def run_physical_test(

@@ -36,7 +36,7 @@ def rig_lines(
         for name in names
     ]
     tables = [*buses, *_sensors(ports, serial, can), *_cameras(servers)]
-    note = "# Replace id and segment: a segment of [chain] for each sensor.\n"
+    note = "# Replace each id, and replace each segment by a segment of [chain].\n"
     return note + "\n".join(tables) if tables else ""
 
 

@@ -24,9 +24,14 @@ if TYPE_CHECKING:
 
 _FASTEST = "max"
 _CHOICES = (
-    "the recorded configuration, as fast as possible: the outputs are compared byte for byte; leave"
-    " out {given}, or --verify"
+    "the recorded configuration at the highest speed, because the outputs are compared byte for"
+    " byte: omit {given}, or --verify"
 )
+
+_Base = Annotated[
+    str | None,
+    typer.Option(help="Base topic for --mqtt. Default: replay/ and the base topic of the rig."),
+]
 
 
 def replay(
@@ -36,20 +41,18 @@ def replay(
     *,
     verify: Annotated[
         bool,
-        typer.Option("--verify", help="Compare every output with the recorded one, byte for byte."),
+        typer.Option(
+            "--verify", help="Compare every output with the recorded output, byte for byte."
+        ),
     ] = False,
     speed: Annotated[
         str | None,
-        typer.Option(
-            help="Speed in multiples of the recorded one, or max. Default: max, and 1 with --mqtt."
-        ),
+        typer.Option(help="Multiple of the recorded speed, or max. Default: max; with --mqtt 1."),
     ] = None,
     mqtt: Annotated[
         bool, typer.Option("--mqtt", help="Publish as the daemon does, below replay/BASE.")
     ] = False,
-    base: Annotated[
-        str | None, typer.Option(help="Base topic of --mqtt. Default: replay/ and the rig's own.")
-    ] = None,
+    base: _Base = None,
     broker: Annotated[
         str | None, typer.Option(help="HOST or HOST:PORT for --mqtt. Default: the rig's broker.")
     ] = None,
@@ -64,10 +67,10 @@ def replay(
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Run a recording through the core again: print its time line, verify or publish it.
+    """Process a recording again as the daemon does: print its time line, verify or publish it.
 
     With the recorded configuration, the outputs equal the recorded outputs, byte for byte. With
-    another rig or calibration, they are the outputs that the daemon would have published with it.
+    another rig or calibration, they equal the outputs of a daemon with this rig or calibration.
 
     Exit codes: 0 success; 1 --verify found a difference or nothing to compare, or no broker; 2
     invalid options, recording, rig or calibration; 128 + N stopped by signal N.
@@ -81,7 +84,7 @@ def replay(
         _verify(file, json=json)
         return
     if (base or broker) and not mqtt:
-        raise ValueError(f"{'--base' if base else '--broker'}: expected --mqtt with it")
+        raise ValueError(f"{'--base' if base else '--broker'}: valid with --mqtt only")
 
     from jointfit_daemon.tools.replay._player import play_recording
 

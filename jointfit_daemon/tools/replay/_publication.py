@@ -125,7 +125,7 @@ class Publication:
             if loop.time() > until:
                 raise BrokerLostError(
                     f"broker {self._settings.host}:{self._settings.tcp_port}: no connection within "
-                    f"{CONNECT_S:g} s: start it, or name another with --broker"
+                    f"{CONNECT_S:g} s: start this broker, or name another broker with --broker"
                 )
             await asyncio.sleep(_POLL_S)
 

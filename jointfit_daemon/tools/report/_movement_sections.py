@@ -217,11 +217,12 @@ def gait_section(results: SessionResults) -> str:
     return section("gait", "Gait cycles", parts)
 
 
-_CYCLE_CAPTION = "Joint angles over the gait cycle, from initial contact to the next one."
+_CYCLE_CAPTION = "Joint angles over the gait cycle, from one initial contact to the next."
 _GAIT_METHOD = (
     "Method: mid-swing is the peak of the sagittal angular velocity of the shank (Aminian et al."
     " 2002, Salarian et al. 2004). Initial contact is the end of the forward rotation of the shank"
-    " that follows, when the foot is farthest in front of the body (principle of Zeni et al. 2008)."
+    " after mid-swing, when the foot is farthest in front of the body (principle of Zeni et al."
+    " 2008)."
     f" At least {LEAST_CYCLES} successive cycles of similar duration count as walking. No foot"
     " switch was used: the instants can differ from the contact of the heel by some hundredths of a"
     " second."
@@ -303,8 +304,8 @@ def range_section(results: SessionResults) -> str:
             table("Range of motion of every angle", head, rows),
             paragraph(
                 "Whole session. ± is one standard deviation of the measurement, where it is known."
-                " Known: share of the frames with a value. The bar covers 95 % of the values, the"
-                " thin line all of them, the gap is the median.",
+                " Known: share of the frames with a value. The bar covers 95 % of the values, and"
+                " the thin line covers all values. The gap in the bar is the median.",
                 "note",
             ),
         ],
@@ -355,7 +356,7 @@ def comparison_section(results: SessionResults) -> str:
         "cameras",
         "Sensors against cameras",
         [
-            table("Angles from the sensors less angles from the cameras", head, rows),
+            table("Angles from the sensors minus angles from the cameras", head, rows),
             f'<div class="panels pairs">{panels}</div>',
             paragraph(
                 "Bias: mean difference. Limits of agreement: bias ± 1.96 standard deviations (Bland"
@@ -406,7 +407,7 @@ def _agreement_figure(found: AngleDifference) -> str:
         line(area, ends, np.full(2, float(np.degrees(found.bias))), "bias"),
     ]
     caption = (
-        f"{name}: difference over the mean of both; bias {degree(found.bias)} (line), limits of"
-        f" agreement {decimal(low)}° to {decimal(high)}° (dashed)"
+        f"{name}: difference over the mean of sensors and cameras; bias {degree(found.bias)}"
+        f" (line), limits of agreement {decimal(low)}° to {decimal(high)}° (dashed)"
     )
     return figure(image(_HALF, 200.0, caption, parts), caption)

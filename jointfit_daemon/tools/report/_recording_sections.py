@@ -67,7 +67,7 @@ def sources_section(results: SessionResults) -> str:
     legend = [("data", "data"), ("gap", "no data")]
     if any(len(gait.cycles_s) for gait in results.gait.values()):
         legend.append(("walking", "walking"))
-    text = "Lost: missing samples as a share of those expected from the first to the last sample."
+    text = "Lost: missing samples as a share of the samples expected in the duration of the data."
     return section(
         "recorded",
         "Recorded data",
@@ -177,7 +177,7 @@ def timing_section(results: SessionResults) -> str:
             )
         )
     if not parts:
-        parts = [paragraph("The file contains no quality of the clocks and no latency.")]
+        parts = [paragraph("The file contains no data about clocks and latency.")]
     return section("timing", "Timing", parts)
 
 

@@ -78,7 +78,7 @@ def responsive(draw: Callable[[float, str], str]) -> str:
 
 
 def nice_ticks(low: float, high: float, most: int) -> list[float]:
-    """Return round values from `low` to `high`, about `most` or fewer."""
+    """Return at most about `most` round values from `low` to `high`."""
     span = high - low
     if not isfinite(span) or span <= 0.0:
         return [low]

@@ -34,7 +34,7 @@ def degree(value_rad: float, places: int = 1) -> str:
 
 
 def with_sd(value_rad: float, sd_rad: float) -> str:
-    """Return an angle, together with its standard deviation if that is known."""
+    """Return an angle, followed by its standard deviation if `sd_rad` is known."""
     return degree(value_rad) + (f" ± {degree(sd_rad)}" if isfinite(sd_rad) else "")
 
 

@@ -11,7 +11,7 @@ from jointfit_daemon.outputs.topics import REQUEST, RESPONSE, TOPICS, Topic
 from jointfit_daemon.supervisor.requests import REQUESTS
 
 _PLACEHOLDERS = {
-    "ID": "id of a device in rig.toml; that of the optical system is mocap",
+    "ID": "id of a device in rig.toml; the id of the optical system is mocap",
     "NAME": "name of a joint",
 }
 _SIGNATURE = {
@@ -32,7 +32,8 @@ def request_schema(name: str) -> dict[str, Any]:
 def asyncapi_document() -> dict[str, Any]:
     """Return the document: one channel for each topic, request and answer.
 
-    The document describes the daemon's view: it sends states and streams, and receives requests.
+    The document describes the daemon's view: the daemon sends states and streams, and receives
+    requests.
     """
     channels: dict[str, Any] = {}
     operations: dict[str, Any] = {}

@@ -14,7 +14,7 @@ def schema(
     topic: Annotated[
         str,
         typer.Argument(
-            help="A topic below the base, as pose or bridge/request/mark. Default: rig.toml.",
+            help="Topic below the base, such as pose or bridge/request/mark. Default: rig.toml.",
             show_default=False,
             autocompletion=complete_topic,
         ),

@@ -184,7 +184,7 @@ def test_small_motion_is_refused_with_exit_code_1(tmp_path: Path) -> None:
     [
         (["--parent", "P1,P2,PP3", "--markers", "C1"], ["'PP3'", "P3"]),
         (["--parent", "P1,P2", "--markers", "C1"], ["expected at least 3", "--plane"]),
-        (["--parent", "P1,P2,C1", "--markers", "C1"], ["C1", "remove from one"]),
+        (["--parent", "P1,P2,C1", "--markers", "C1"], ["C1", "remove them from one option"]),
         ([*OPTIONS, "--method", "spheer"], ["did you mean 'sphere'", "score"]),
         ([*OPTIONS, "--method", "oriented"], ["inertial", 'center_method = "oriented"']),
         (["--parent", "P1,P2,P3", "--markers", "C1,C2", "--method", "score"], ["three"]),

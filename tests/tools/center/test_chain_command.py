@@ -226,7 +226,7 @@ def test_in_space_a_frame_needs_three_markers(tmp_path: Path) -> None:
     write_trc(tmp_path / "chain.trc", planar_chain()[0])
     result = run(app, ["center", str(tmp_path / "chain.trc"), *CHAIN[:-2]])
     assert result.exit_code == 2
-    assert "3 markers of a frame (2 for a planar movement, with --plane)" in result.stderr
+    assert "3 markers that define a frame (2 for a planar movement, with --plane)" in result.stderr
 
 
 def test_exchanged_names_are_reported_with_their_time(tmp_path: Path) -> None:

@@ -66,7 +66,7 @@ def server_of(broker: Broker) -> DashboardServer:
 async def test_a_missing_broker_is_named_with_its_address(browser: Browser) -> None:
     port = free_port()
     async with page_of(browser, DashboardServer(BrokerAddress(HOST, port))) as page:
-        await page.until_text("#banner", f"No broker at {HOST}:{port}")
+        await page.until_text("#banner", f"No connection to the broker at {HOST}:{port}")
         await page.until_text("#banner", "start the broker, or correct --broker")
         assert await page.text("#rig-state") == "Connection lost"
         await show_state(page, "no-broker")
@@ -196,7 +196,9 @@ async def test_a_message_of_another_program_is_ignored_and_named(
                     "device/x/info",
                 ):
                     await client.publish(f"{rig.base}/{topic}", noise)
-        await page.until_text("#notices", "was ignored: its content is not that of jointfitd")
+        await page.until_text(
+            "#notices", "was ignored: its content is not in the format of jointfitd"
+        )
         await page.until_text("#angle-value", "°")
 
 
@@ -331,7 +333,9 @@ async def test_daemon_broker_and_server_are_lost_and_regained_with_a_gap_in_the_
             await page.page.wait_for_function(GAPS)
 
             each_broker.stop()
-            await page.until_text("#banner", f"No broker at {HOST}:{each_broker.port}")
+            await page.until_text(
+                "#banner", f"No connection to the broker at {HOST}:{each_broker.port}"
+            )
             each_broker.start()
             await page.until_text("#angle-value", "°")
             await page.page.wait_for_selector("#banner", state="hidden")
@@ -357,7 +361,7 @@ async def test_a_lost_server_is_named_and_the_page_returns_with_it(
         await page.until_text(
             "#banner", f"dashboard server at {HOST}:{listen.port} does not answer"
         )
-        await page.until_text("#banner", "“jointfit dashboard” runs, and the network")
+        await page.until_text("#banner", "“jointfit dashboard” runs, and check the network")
         assert "Works" not in await page.text("#cards")
         await show_state(page, "no-server")
         async with server_of(broker).listening(listen):

@@ -108,7 +108,7 @@ def test_another_program_on_the_port_is_named(tree: Path) -> None:
     add_process(tree, 4711, "minicom", "/dev/ttyUSB0")
     found = one(check_serial(gateway(tree), [PORT]), "error")
     assert "minicom (process 4711)" in found.text
-    assert found.remedy == "close it: kill 4711"
+    assert found.remedy == "close this program: kill 4711"
 
 
 def test_the_daemon_on_the_port_is_a_note(tree: Path) -> None:

@@ -212,7 +212,7 @@ def test_help_names_the_enter_key_only_where_there_is_a_proposal(
     done = init(tmp_path, lines=[*[""] * 8, "?", "", "can0", "?", ""])
     before, _, ids = done.output.partition("CAN identifiers of")
     assert "Enter takes the proposal" not in before.partition("Serial ports that are")[2]
-    assert "Enter takes the proposal in brackets, '<' returns." in ids
+    assert "Enter takes the proposal in brackets, '<' goes back one question." in ids
     assert "[later] ('find' searches)" in ids
 
 

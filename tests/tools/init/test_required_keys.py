@@ -256,7 +256,9 @@ def test_typed_identifiers_are_those_of_their_mode() -> None:
     started = dialogue(devices=["can0"])
     answer(started, driver="lpms-can", setting="sequential", setting_="int16")
     asked = question(started)
-    assert asked.help.startswith("frame1, frame2, frame3, frame4, as 0x000 0x001 0x002 0x003. ")
+    assert asked.help.startswith(
+        "frame1, frame2, frame3, frame4, such as 0x000 0x001 0x002 0x003. "
+    )
     with pytest.raises(AnswerError, match=r"sequential identifiers follow each other"):
         answer(started, ids="0x181 0x281 0x381 0x481")
     with pytest.raises(AnswerError, match="expected 4 identifiers"):

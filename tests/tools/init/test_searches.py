@@ -117,7 +117,7 @@ def test_identifiers_on_a_bus_become_proposals(monkeypatch: pytest.MonkeyPatch) 
     [
         ("/dev/ttyACM0", None, "serial adapter"),
         ("can0", "can0: the interface is down", "the interface is down"),
-        ("can0", None, "no sensor was received"),
+        ("can0", None, "no data of a sensor were received"),
     ],
 )
 def test_a_bus_without_sensors_is_explained(

@@ -188,7 +188,7 @@ def test_missing_layout_and_missing_poses_name_the_right_to_read() -> None:
     assert "bridge/info) is missing: the account cannot read it" in words(state, at_s=0.1)
     state = connected_state()
     take(state, "bridge/state", {"v": 1, "state": "online"})
-    assert "account cannot read it" in words(state)
+    assert "account cannot read this topic" in words(state)
 
 
 def test_the_clock_of_the_gateway_is_compared_with_this_one() -> None:

@@ -88,8 +88,8 @@ def test_stored_version_and_calibration_file_are_used(
     [
         (("--speed", "fast"), "--speed fast: expected a number above 0"),
         (("--speed", "-1"), "--speed -1: expected a number above 0"),
-        (("--verify", "--mqtt"), "leave out --mqtt"),
-        (("--base", "x"), "--base: expected --mqtt with it"),
+        (("--verify", "--mqtt"), "omit --mqtt"),
+        (("--base", "x"), "--base: valid with --mqtt only"),
         (("--calibration", "9"), "no such version"),
         (("--calibration", "none.json"), "none.json"),
     ],

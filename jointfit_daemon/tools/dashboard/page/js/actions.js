@@ -22,12 +22,12 @@ export function createActions(store, request, showView) {
 const ACTIONS = {
   static: () => ({
     menu: "Record the static pose again…", title: "Record the static pose again", button: "Start standing", view: "calibrate",
-    text: "Stand upright and still, with straight joints. The new static pose corrects the headings of the sensors, for example after they were put on again. Poses continue meanwhile.",
+    text: "Stand upright and still, with straight joints. The new static pose corrects the headings of the sensors, for example after they were put on again. The daemon continues to publish poses.",
     command: "static",
   }),
   mark: () => ({
     menu: "Mark this instant…", title: "Mark this instant", button: "Mark now", command: "mark",
-    text: "The mark gets the instant at which jointfitd receives it. It appears in the log and in recordings.",
+    text: "The time of the mark is the time at which jointfitd receives it. It appears in the log and in recordings.",
     field: { label: "Text", maxlength: "200", value: "mark" },
     content: (text) => ({ text }),
     answer: (data) => `Mark ${data.number} at ${formatClock(data.t_us)}: ${data.text}`,

@@ -7,7 +7,7 @@ import { UNKNOWN, angleName, flagSentence, formatNumber, isMinorFlag, isolate, t
 const NUMBER_MS = 200;
 const STALE_MS = 1500;
 const OPTICAL_GAP_US = 150_000;
-const GAP_PERIODS = 3.5; // a pause of more periods interrupts the curve
+const GAP_PERIODS = 3.5; // a longer pause, in periods of the poses, interrupts the curve
 const MARK = { dash: [4, 4], font: "600 12px system-ui, sans-serif" };
 const HAS_SD = /^(flexion|elevation|inner)_deg$/;
 const STORED_CHOICE = "jointfit-angle";
@@ -155,7 +155,7 @@ function usualPeriod(poses) {
 
 function noAngleReason(store) {
   if (!store.info) return "The angles are unknown: no message on bridge/info was received.";
-  if (store.info.segments.length < 2) return "A limb of one segment has no joint angle. The Table view has its orientation.";
+  if (store.info.segments.length < 2) return "A limb of one segment has no joint angle. The Table view shows the orientation of the segment.";
   return "The pose contains no joint angle.";
 }
 

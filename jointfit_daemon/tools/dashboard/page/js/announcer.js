@@ -1,4 +1,4 @@
-// The only live region of the page. It shows at most one text per second, and never the same text twice.
+// Announcements to screen readers: at most one per second, and never the same text twice in succession.
 
 const INTERVAL_MS = 1000;
 

@@ -26,7 +26,7 @@ export function createAxesCheck(store, link) {
   const update = () => {
     if (!visible || !isFresh(store)) return;
     updateDrawings(store, drawings, cards);
-    updateNote(); // before the drawings, because a later change would move them
+    updateNote(); // the note is above the drawings, so a later change of its height would move them
   };
   store.on("sensors", update);
   setInterval(() => { if (visible) updateNote(); }, 500);
@@ -84,7 +84,7 @@ function createCard(name) {
   return { canvas, turn, start: null, root: createElement("article", { class: "card" }, createElement("h3", { dir: "auto" }, name), canvas, turn) };
 }
 
-/** Return the rotation between two orientations: its angle, degrees, and the nearest sensor axis. */
+/** Return the rotation between two orientations: its angle, the nearest sensor axis, and the angle between this axis and the axis of rotation, degrees. */
 export function turnSince(start, q) {
   const [w, ...v] = multiply(conjugate(start), q); // in the axes of the sensor
   const length = Math.hypot(...v);

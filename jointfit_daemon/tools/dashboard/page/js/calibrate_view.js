@@ -134,7 +134,7 @@ function createStep(view, step, number, count) {
   const figures = createFigures(step.figures);
   const start = createElement("button", { class: "button primary", type: "button", onclick: () => sendRequest(view, { phase: step.phase }) }, step.button);
   const skip = step.phase === "align" && count > 1
-    ? createElement("button", { class: "button", type: "button", onclick: () => { view.chosen = "static"; updateView(view); } }, "Skip: aligned before")
+    ? createElement("button", { class: "button", type: "button", onclick: () => { view.chosen = "static"; updateView(view); } }, "Skip: already aligned")
     : null;
   const again = createElement("p", { class: "banner warning", dir: "auto", hidden: true });
   const instructions = createElement(
@@ -197,7 +197,7 @@ function updateResult(view) {
   }
   const buttons = [];
   if (calibration.kept) {
-    buttons.push(createElement("p", {}, "To use a worse result all the same, repeat the movement and accept it:"));
+    buttons.push(createElement("p", {}, "This button repeats the movement and accepts its result, even if it is worse:"));
     buttons.push(createElement("button", { class: "button", type: "button", onclick: () => sendRequest(view, { phase: "functional", force: true }) }, "Move again and accept the result"));
   }
   if (calibration.quality?.online?.rounds > 0) {

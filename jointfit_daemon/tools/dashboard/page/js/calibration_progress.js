@@ -72,7 +72,7 @@ function updateJoints(root, joints) {
     errorText(joint.noise_error_mm, 1),
     formatNumber(joint.arc_deg, 0, "°"),
     SOURCES[joint.source] ?? joint.source,
-    createElement("span", { class: `status ${joint.met ? "ok" : "unknown"}` }, joint.met ? "enough" : "more"),
+    createElement("span", { class: `status ${joint.met ? "ok" : "unknown"}` }, joint.met ? "enough" : "not yet"),
   ]);
   patchTable(root, createTable("Predicted errors of the joint centres", COLUMNS, rows));
 }

@@ -29,8 +29,8 @@ function summary(quality) {
     .map(([joint, byMethod]) => [joint, byMethod[holdout.method]])
     .filter(([, error]) => typeof error === "number")
     .map(([joint, error]) => `${titleOf(joint)} flexion ${formatNumber(error, 1)}° RMS`);
-  if (errors.length === 0) return "In force. It was made without cameras, so its error was not measured.";
-  return `Error on movement that was kept out of the fit: ${errors.join(", ")}.`;
+  if (errors.length === 0) return "This calibration was made without cameras, so its error was not measured.";
+  return `Error on movement that the fit did not use: ${errors.join(", ")}.`;
 }
 
 function jointTable(quality) {

@@ -32,7 +32,7 @@ export function stepsOf(info, cameras) {
     {
       phase: "static", short: "Stand still", title: "Stand still", button: "Start standing", figures: [limb === LIMBS[0] ? "stand" : "upright"],
       tasks: [cameras ? "Put on all sensors and markers." : "Put on all sensors.", "Stand upright with straight joints, facing one way.", "Start, and stay still until the time is over."],
-      note: "Required every time the sensors are put on. A movement starts the time again.",
+      note: "Required every time the sensors are put on. If you move, the time starts again.",
     },
     {
       phase: "functional", optical: true, short: "Move", title: "Move every joint", button: "Start moving", figures: limb.moves,

@@ -5,7 +5,7 @@ import { dot, mix, norm, rotate, scale, subtract } from "./geometry.js";
 const ELEVATION = 0.16;
 const FOLLOW_S = 0.9;
 const TURN_S = 3;
-const MIDDLE = 0.46; // height of the limb's centre in the window, from the top, so the floor is visible
+const MIDDLE = 0.46; // share of the height above the centre of the limb; the floor is then visible
 const JUMP = 0.5; // distance, in lengths of the limb, above which the view jumps instead of moving smoothly
 
 /** Return a camera; `turn` is the angle of the view about the vertical, rad; null until it is set. */

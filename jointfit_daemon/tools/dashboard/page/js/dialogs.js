@@ -22,7 +22,7 @@ export function createDialogs(link, requests) {
       setText(byId("login-reason"), reason);
       if (byId("login").open) return;
       byId("login").showModal();
-      if (byId("login-user").value !== "") byId("login-password").focus(); // the password is the usual mistake
+      if (byId("login-user").value !== "") byId("login-password").focus(); // usually the password was wrong
     },
     /** Wait until a key is entered; throw an Error if the dialog is closed without a key. */
     askForKey() {

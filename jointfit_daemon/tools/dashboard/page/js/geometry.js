@@ -32,7 +32,7 @@ export function rotate(q, v) {
   return [x, y, z];
 }
 
-/** Return the normalised mean of two rotations; q and −q are the same rotation. */
+/** Return the rotation between a (share 0) and b (share 1); q and −q are the same rotation. */
 export function mixRotations(a, b, share) {
   const sign = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] < 0 ? -1 : 1;
   const q = a.map((value, i) => value * (1 - share) + sign * b[i] * share);

@@ -21,7 +21,7 @@ export function pageState(link, store, now_us = null) {
   if (store.bridge === "offline") {
     return {
       level: "error", words: "jointfitd is not running",
-      loss: "jointfitd stopped or lost its broker. The page continues when it is back. Check it with: systemctl status jointfitd",
+      loss: "jointfitd stopped or lost its broker. The page continues when jointfitd is back. Check it with: systemctl status jointfitd",
     };
   }
   if (store.received.has("pose/ui") && poseAgeMs(store) > SILENT_MS) {
@@ -102,21 +102,21 @@ function emptyContent(link, store, configuration, rigs, choose, known) {
   if (link.state === "lost" && store.pose === null) {
     return { kind: "lost", children: [
       createElement("h2", {}, "Not connected"),
-      createElement("p", {}, "The page tries again every two seconds and continues by itself. Check the broker, and start the dashboard with its address:"),
+      createElement("p", {}, "The page tries to connect every two seconds and continues by itself. Check the broker, and start the dashboard with the address of the broker:"),
       createElement("pre", { tabindex: "0" }, createElement("code", {}, "systemctl status mosquitto\njointfit dashboard --broker mqtt://localhost:1883")),
     ] };
   }
   if (link.state === "refused" && store.pose === null) {
     return { kind: "refused", children: [
       createElement("h2", {}, "Log in to see the rig"),
-      createElement("p", {}, "The broker has accounts. Ask its administrator for one that may read the topics of the rig."),
+      createElement("p", {}, "The broker has accounts. Ask its administrator for an account that may read the topics of the rig."),
     ] };
   }
   if (link.state !== "connected") return null;
   if (link.base === null && rigs.size > 1) {
     return { kind: `rigs ${[...rigs.keys()].join()}`, children: [
       createElement("h2", {}, "Several rigs use this broker"),
-      createElement("p", {}, "Choose the one to show. The list also has rigs whose daemon is stopped."),
+      createElement("p", {}, "Choose the rig to show. The list also contains rigs whose daemon is stopped."),
       ...[...rigs].map(([base, info]) =>
         createElement("button", { class: "button", type: "button", dir: "auto", onclick: () => choose(base) }, `${info.rig} (${base})`)),
     ] };
@@ -124,7 +124,7 @@ function emptyContent(link, store, configuration, rigs, choose, known) {
   if (store.otherVersion !== null) {
     return { kind: "version", children: [
       createElement("h2", {}, "This page cannot read the messages of jointfitd"),
-      createElement("p", {}, "Page and daemon are of different versions. Install the same version of both, then open the page again."),
+      createElement("p", {}, "Page and daemon have different versions. Install the same version of both, then open the page again."),
     ] };
   }
   if (store.bridge === "unknown" && store.pose === null) {
@@ -133,7 +133,7 @@ function emptyContent(link, store, configuration, rigs, choose, known) {
       createElement("h2", {}, `Waiting for jointfitd on ${configuration.broker}`),
       createElement("p", {}, "The broker answers, but no rig publishes on it. Start the daemon with the configuration of the rig:"),
       createElement("pre", { tabindex: "0" }, createElement("code", {}, "jointfitd --config rig.toml")),
-      createElement("p", { class: "caption" }, "If it runs: its host and port under [mqtt] must be those of this broker, and your account must have the right to read its topics."),
+      createElement("p", { class: "caption" }, "If the daemon runs: host and port under [mqtt] in its rig.toml must be those of this broker, and your account must have the right to read the topics of the rig."),
     ] };
   }
   const phase = store.calibration?.phase;

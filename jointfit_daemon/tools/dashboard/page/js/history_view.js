@@ -87,7 +87,7 @@ function stateOf(entry, inForce) {
     entry.online ? `online learning, round ${entry.online.rounds}` : "",
   ].filter(Boolean).join(", ");
   if (entry.version === inForce) return createElement("span", { class: "status ok" }, ["in force", origin].filter(Boolean).join(": "));
-  if (!entry.usable) return createElement("span", { class: "status unknown" }, "of another limb");
+  if (!entry.usable) return createElement("span", { class: "status unknown" }, "made for another limb");
   return origin || "stored";
 }
 

@@ -7,7 +7,7 @@ import { poseAgeMs, valueOf } from "./store.js";
 import { formatNumber, isolate, titleOf } from "./words.js";
 
 const FRAME_MS = 1000 / 30;
-const DELAY_MS = 110; // one period of pose/ui, because the drawing interpolates between two poses
+const DELAY_MS = 110; // longer than a period of pose/ui, because the drawing interpolates between two poses
 const STALE_MS = 1500;
 const SIDE_TURN = -0.6;
 const FRONT_TURN = -1.15; // in a view from the side, two legs cover each other
@@ -17,7 +17,7 @@ const THICKNESS = [0.15, 0.105];
 const AXIS_SHARE = 0.15;
 const ASSUMED_M = 0.4; // length of a drawn segment whose length is unknown
 
-/** Draw the limb of a store; return the view, whose `frames` holds the time of each frame, ms. */
+/** Draw the limb of a store; return the view, whose `frames` contains the drawing time of each frame, ms. */
 export function createLimbView(store) {
   const canvas = byId("limb");
   const view = {
@@ -368,7 +368,7 @@ export function updateLimbCaption(store) {
   byId("legend-axes").hidden = !Object.values(store.calibration?.quality?.sensors ?? {}).some((mount) => mount?.q_sensor_segment);
   if (!store.pose) return setText(caption, "No pose was received.");
   if (!store.info) return setText(caption, "The limb cannot be drawn: no message on bridge/info was received.");
-  if (ageMs > STALE_MS) return setText(caption, `No pose for ${Math.round(ageMs / 1000)} s: the drawing is the last one.`);
+  if (ageMs > STALE_MS) return setText(caption, `No pose for ${Math.round(ageMs / 1000)} s: the drawing shows the last pose.`);
   const parts = store.info.segments.map((name) => {
     const segment = valueOf(store.pose.segments, name);
     if (!segment?.q) return `${isolate(titleOf(name))}: unknown`;

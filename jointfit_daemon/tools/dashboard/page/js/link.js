@@ -147,21 +147,21 @@ function openWebSocket(url, protocols, link) {
 function lossReason(link, configuration) {
   const { broker, websocket } = configuration;
   if (!navigator.onLine && !/^(localhost|127\.|\[::1\])/.test(location.host)) {
-    return "This device has no network connection. The page continues when it is back.";
+    return "This device has no network connection. The page continues when the network is back.";
   }
-  if (link.closeCode === BROKER_UNREACHABLE) return `No broker at ${broker}: ${link.closeReason}.`;
+  if (link.closeCode === BROKER_UNREACHABLE) return `No connection to the broker at ${broker}: ${link.closeReason}.`;
   if (link.closeCode === BROKER_CLOSED) return `The broker at ${broker} ended the connection: ${link.closeReason}. Check that it runs.`;
   if (!websocket) return null;
-  if (link.opened) return `The broker at ${broker} does not answer or closed the connection: check that it runs, and the network.`;
-  return `No WebSocket at ${broker}: check that the broker runs, and that this is the port of its WebSocket listener, not its TCP port (often 1883). Without one, start the dashboard with --broker mqtt://HOST:PORT.`;
+  if (link.opened) return `The broker at ${broker} does not answer or closed the connection: check the broker and the network.`;
+  return `No WebSocket at ${broker}: check that the broker runs, and that this is the port of its WebSocket listener, not its TCP port (often 1883). If the broker has no such listener, start the dashboard with --broker mqtt://HOST:PORT.`;
 }
 
-/** Ask the server of the page for the cause of a loss, which the tunnel alone does not show. */
+/** Return the cause of a loss, after a request that shows whether the server of the page answers. */
 async function serverReason(link, configuration) {
   const opened = link.opened;
   const answer = await fetch("config.json", { cache: "no-store", signal: AbortSignal.timeout(SERVER_MS) }).catch(() => null);
   if (answer === null) {
-    return `The dashboard server at ${location.host} does not answer: check that “jointfit dashboard” runs, and the network.`;
+    return `The dashboard server at ${location.host} does not answer: check that “jointfit dashboard” runs, and check the network.`;
   }
   if (!opened) {
     return `The dashboard server at ${location.host} accepts no WebSocket: too many pages are open, or a proxy on the way does not pass WebSockets on.`;

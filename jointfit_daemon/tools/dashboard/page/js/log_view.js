@@ -1,4 +1,4 @@
-// The event log: newest first, by level.
+// The event log: newest event first, each with its level.
 
 import { byId, createElement, setText } from "./dom.js";
 import { createMarkForm, createMarker } from "./marks.js";

@@ -32,8 +32,8 @@ async function readConfiguration() {
   return { ...server, base: parameters.get("base") ?? server.base, remark: brokerRemark(parameters.get("broker"), server) };
 }
 
-// The server names the only broker to which its security policy permits connections. An address from
-// another person must not send a password to another broker.
+// The server names the only broker to which its security policy permits connections. A link from
+// another person must not make the page send a password to another broker.
 function brokerRemark(wanted, server) {
   if (wanted === null || wanted === server.websocket) return "";
   const start = wanted.startsWith("wss://") || wanted.startsWith("ws://") ? wanted : "wss://HOST/PATH";

@@ -12,7 +12,7 @@ const STORED_OFF = "jointfit-mark-key-off";
 export function createMarker(store, request) {
   return async (text) => {
     const data = await request("mark", { text: text.trim() || DEFAULT_TEXT });
-    const where = store.recording?.active === false ? " (nothing is recorded: in the log only)" : "";
+    const where = store.recording?.active === false ? " (in the log only, because no recording runs)" : "";
     return `Mark ${data.number} at ${formatClock(data.t_us)}: ${isolate(data.text)}${where}`;
   };
 }
@@ -50,7 +50,7 @@ async function showAnswer(note, answer) {
 
 /**
  * Mark with one key in every view, unless a text field or a dialog has the focus, or the user
- * has disabled the key. The answer appears in the form; if it is hidden, for some seconds over the page.
+ * has disabled the key. The answer appears in the form; if the form is hidden, for some seconds over the page.
  */
 export function connectMarkKey(form, mayMark) {
   const box = byId("mark-key");

@@ -35,12 +35,12 @@ function noticesOf(link, store, access, configuration) {
   if (link.state !== "connected") return notices;
   if (store.otherVersion !== null) notices.push(["warning", versionSentence(store, configuration)]);
   if (store.faulty !== null) {
-    notices.push(["warning", `A message on ${isolate(store.faulty)} was ignored: its content is not that of jointfitd. Check which program publishes below ${isolate(link.base)}.`]);
+    notices.push(["warning", `A message on ${isolate(store.faulty)} was ignored: its content is not in the format of jointfitd. Check which program publishes below ${isolate(link.base)}.`]);
   }
   const hidden = hiddenTopics(access);
   if (hidden.length > 0) notices.push(["warning", hiddenSentence(link, hidden)]);
   if (access.mayRequest === false) {
-    notices.push(["info", `${account(link)} can watch only: jointfitd did not receive its requests, or it may not read the answers. To calibrate, log in as an operator with the right to write ${isolate(link.base)}/bridge/request/+.`]);
+    notices.push(["info", `${account(link)} can watch only: jointfitd did not receive its requests, or this account may not read the answers. To calibrate, log in as an operator with the right to write ${isolate(link.base)}/bridge/request/+.`]);
   }
   const clock = clockSentence(store);
   if (clock !== "") notices.push(["info", clock]);
@@ -65,5 +65,5 @@ function clockSentence(store) {
   if (now === null) return "";
   const behind = Date.now() / 1000 - now / 1e6;
   if (Math.abs(behind) < CLOCK_S) return "";
-  return `The clock of the gateway is ${formatDuration(Math.abs(behind))} ${behind > 0 ? "behind" : "ahead of"} the clock of this device. Times and ages on this page are those of the gateway.`;
+  return `The clock of the gateway is ${formatDuration(Math.abs(behind))} ${behind > 0 ? "behind" : "ahead of"} the clock of this device. Times and ages on this page are from the clock of the gateway.`;
 }

@@ -4,7 +4,7 @@ import { createElement, setClass, setText } from "./dom.js";
 import { formatNumber } from "./words.js";
 
 const ASK_MS = 700;
-const LEAD = "The daemon checks whether world, axes and quaternion direction of a sensor are as configured. Lay the sensor flat, its z axis up, and start. Its data are missing for some seconds, because its port is opened again.";
+const LEAD = "The daemon checks whether world, axes and quaternion direction of a sensor are as configured. Lay the sensor flat, with its z axis up, and start. Its data are missing for some seconds, because the daemon opens its port again.";
 
 /** Return the panel of the test; `request(command, content)` sends a request to the daemon. */
 export function createPhysicalTest(store, request) {
@@ -67,7 +67,7 @@ export function createPhysicalTest(store, request) {
     steps.hidden = true;
     setClass(status, "test-status");
     setText(status, "Stopped.");
-    request("physical-test", { device: choice.value, action: "stop" }).catch(() => undefined); // it ends by itself
+    request("physical-test", { device: choice.value, action: "stop" }).catch(() => undefined); // without this request, the test ends by itself
   });
 
   const update = () => {

@@ -86,7 +86,7 @@ const FIGURES = {
   },
 };
 
-/** Return the drawings with these names, and a function that marks the drawings of a remedy. */
+/** Return the drawings with these names, and a function that marks the drawings that fit a remedy. */
 export function createFigures(names) {
   const figures = names.map((name) => ({ ...FIGURES[name], root: drawFigure(FIGURES[name]) }));
   const root = createElement("div", { class: `figures n${figures.length}` }, ...figures.map((figure) => figure.root));

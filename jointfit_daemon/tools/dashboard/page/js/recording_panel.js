@@ -67,7 +67,7 @@ export function createRecordingPanel(store, access, request, openAction) {
   };
 
   start.addEventListener("click", async () => {
-    refusal = ""; // the recording already runs, so the second start has no effect
+    refusal = ""; // an earlier refusal does not apply to the new attempt
     try {
       await request("record", { action: "start" });
     } catch (error) {

@@ -4,7 +4,7 @@ import { byId, createElement, setClass, setText } from "./dom.js";
 import { gatewayNow, valueOf } from "./store.js";
 import { UNKNOWN, clockQuality, formatDuration, formatNumber } from "./words.js";
 
-const RATE_SHARE = 0.95; // share of the usual rate below which a device is slow
+const RATE_SHARE = 0.95; // share of the output rate below which a device is slow
 
 /** Show a card for each device of a store. */
 export function createSensorCards(store) {
@@ -57,7 +57,7 @@ function stateOf(store, name, availability, health, flags) {
   if (availability === "offline") return ["error", "No data: check cable and power"];
   if (availability !== "online") return ["unknown", "State not received"];
   if (flags.includes(`stuck:${name}`) || health?.sensor === "stuck") return ["error", "Stuck: repeats its value"];
-  if (flags.includes(`slipped:${name}`)) return ["error", "Slipped on the body: fix it"];
+  if (flags.includes(`slipped:${name}`)) return ["error", "Slipped on the body: fasten it"];
   if (health?.sensor === "lost") return ["error", "No data: check cable and power"];
   const wanted = store.info?.output_rate_hz;
   const slow = health?.rate_hz != null && wanted != null && health.rate_hz < RATE_SHARE * wanted

@@ -66,7 +66,7 @@ function tablesOf(store, openAction) {
 function latencyTable(latency) {
   const stages = {
     decoded: "arrival to decoded", aligned: "to aligned", fused: "to joint angles",
-    encoded: "to JSON", written: "to the broker's socket", total: "in all",
+    encoded: "to JSON", written: "to the broker's socket", total: "total",
   };
   const rows = Object.entries(stages).map(([stage, words]) => {
     const found = latency[`${stage}_us`] ?? {};

@@ -8,7 +8,7 @@ const FINDERS = {
   traffic: { text: "Find by its data", wait: "Receiving on the port …" },
   movement: {
     text: "Find by moving it",
-    wait: "Hold all sensors still until this page asks you to turn one.",
+    wait: "Hold all sensors still until this page asks you to turn one of them.",
   },
   identifiers: { text: "Find on the bus", wait: "Receiving for two seconds." },
   stream: { text: "Read the stream again", wait: "Asking the motion-capture system." },
@@ -22,7 +22,7 @@ function connect() {
   socket.addEventListener("open", () => send({ do: "show" }));
   socket.addEventListener("message", (event) => show(JSON.parse(event.data)));
   socket.addEventListener("close", () => {
-    setText(byId("question-error"), "The gateway does not answer. Start it with: jointfit dashboard --set-up FOLDER");
+    setText(byId("question-error"), "The gateway does not answer. Start the page on the gateway with: jointfit dashboard --set-up FOLDER");
     setTimeout(connect, RETRY_MS);
   });
 }
@@ -60,7 +60,7 @@ function showAnswers(state) {
   byId("answers").replaceChildren(...answered.flatMap(({ text, value }) => [
     createElement("dt", { dir: "auto" }, text), createElement("dd", { dir: "auto" }, value || "none"),
   ]));
-  byId("found").replaceChildren(...(state.found.length ? state.found : [{ address: "None. You may type their names, or connect them.", text: "" }]).map(
+  byId("found").replaceChildren(...(state.found.length ? state.found : [{ address: "None. Connect the devices, or type their names.", text: "" }]).map(
     ({ address, text }) => createElement("li", {}, address, text ? createElement("span", { class: "about" }, text) : null)));
 }
 
@@ -81,7 +81,7 @@ function showQuestion(question, position) {
   const postponed = options.length === 1; // the only option is "later", so the user usually types an answer
   const input = createElement("input", { id: "typed", type: "text", autocomplete: "off", spellcheck: "false", dir: "auto",
     value: isListed ? "" : question.default, placeholder: question.optional ? "empty: none" : null });
-  const typed = createElement("label", { class: "typed" }, options.length && !postponed ? "Or type it" : "Answer", input);
+  const typed = createElement("label", { class: "typed" }, options.length && !postponed ? "Or type an answer" : "Answer", input);
   const list = createElement("fieldset", { "aria-labelledby": "question-text" }, ...options);
   // The last answer that was chosen or typed is sent.
   list.addEventListener("change", () => { input.value = ""; });
@@ -126,7 +126,7 @@ function download(text) {
 function showWritten(written) {
   setText(byId("question-text"), "The rig is written");
   const open = written.open.length > 0;
-  setText(byId("question-help"), `${written.path} ${open ? "has places that are not filled in yet" : "is valid"}. Continue in a terminal of the gateway:`);
+  setText(byId("question-help"), `${written.path} ${open ? "still lacks the values listed below" : "is valid"}. Continue in a terminal of the gateway:`);
   byId("question-field").replaceChildren(
     ...(open ? [createElement("ul", {}, ...written.open.map((place) => createElement("li", {}, place)))] : []),
     ...written.warnings.map((warning) => createElement("p", { class: "fault" }, `Warning: ${warning}`)),

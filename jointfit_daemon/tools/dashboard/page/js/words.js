@@ -72,7 +72,6 @@ export function angleName(key) {
 
 const FLAGS = {
   uncalibrated: "Not calibrated: angles are unknown.",
-  other_chain: "The stored calibration belongs to another limb: calibrate again.",
   headings_from_static: "Headings come from the static pose: there was no align phase.",
   same_pose_assumed: "The static pose was recorded without cameras; the same pose as before is assumed.",
   stuck: "% repeats its value and is not used.",
@@ -83,12 +82,12 @@ const FLAGS = {
   one_sensor: "Only one sensor of % contributes.",
   held: "No data from the sensors of %: the last orientation is held.",
   lost: "No data from the sensors of %.",
-  untrained: "% is outside the movements of the calibration: its error may be larger.",
+  untrained: "% is outside the movements of the calibration: its error may be larger than in the calibration.",
   extrapolating: "A sensor is late and was extrapolated.",
   origin_fixed: "The cameras do not see the first joint.",
   axis_vertical: "% uses the vertical as its axis: the calibration found no joint centre.",
   axis_from_shoulder: "Axes of % come from the shoulder alone: calibrate with elbow flexion.",
-  facing_unknown: "The flexion axis is unknown; the facing direction is used.",
+  facing_unknown: "The flexion axis is unknown; the subject is assumed to have faced the y axis of the world.",
   uncorrected: "Sensors are used without correction (procedure of the patent).",
   gimbal: "Gimbal lock: flexion and rotation cannot be separated.",
 };
