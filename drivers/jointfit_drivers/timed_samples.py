@@ -127,7 +127,10 @@ class TimedSamples(Refusals):
             ticks = reading.ticks or 0
             field = magnetic if self._raw.magnetometer else None
             measured = RawReading(ticks, rate, force, field)
-            if ticks == self._raw_ns or not is_plausible(measured):
+            if ticks == self._raw_ns:
+                reason = "raw measurements with the time of the previous ones"
+                return [self.refuse(reading.size, reason)]
+            if not is_plausible(measured):
                 return [self.refuse(reading.size, "raw measurements out of range")]
             self._raw_ns = ticks
             return self._raw.take(RawStamp(reading.arrival_ns, ticks), measured)

@@ -1,4 +1,4 @@
-"""Drivers at work on simulated devices: what several tests of drivers share."""
+"""Helpers that run drivers with simulated devices, for tests of several drivers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 
 class DriverRun:
-    """A running driver, its chunks decoded."""
+    """A running driver, and the decoded output of its chunks."""
 
     def __init__(self, driver: Driver) -> None:
         self.decoder: Any = driver.decoder()
@@ -38,7 +38,7 @@ class DriverRun:
         return [event for event in self.events if isinstance(event, ImuSample)]
 
     async def wait_for(self, count: int) -> None:
-        """Wait for `count` samples; raises the error that ended the driver."""
+        """Wait for `count` samples; raise the error that ended the driver, if any."""
         async with asyncio.timeout(5):
             while len(self.samples) < count:
                 if self.task.done():
@@ -52,7 +52,7 @@ class DriverRun:
 
 @contextlib.asynccontextmanager
 async def serving(*devices: Any, feeding: bool = False) -> AsyncIterator[None]:
-    """Run devices; with `feeding`, each has a sample every 10 ms. Unplug them in the end."""
+    """Run devices, and unplug them at the end; with `feeding`, each sends every 10 ms."""
 
     async def feed(device: Any) -> None:
         number = 0
@@ -87,7 +87,7 @@ def xcdi_driver(
 
 
 class TextDevice:
-    """Another kind of device: answers every request with a line of text, as modems do."""
+    """A device of another kind, which answers every request with a line of text, like a modem."""
 
     def __init__(self, link: Path) -> None:
         self._line = PtyLine(link)

@@ -82,7 +82,7 @@ def test_a_wall_clock_stepped_by_an_hour_in_a_burst_moves_no_arrival(
     stamps = received(host, arrivals, wake_ups)
     moved = [abs(stamp - arrival) for stamp, arrival in zip(stamps, arrivals, strict=True)]
     assert max(moved) <= 1_000_000
-    assert max(moved) < 1_000  # and but for the resolution of the pairing not at all
+    assert max(moved) < 1_000  # the resolution with which the two clocks are paired
     assert all(a <= b + 1_000 for a, b in pairwise(stamps))
 
 
@@ -106,12 +106,12 @@ def test_arrival_stamps_are_never_in_the_future() -> None:
 
 @pytest.mark.alone
 def test_stamps_are_the_kernels_however_busy_the_loop_is() -> None:
-    """The goal of 0.1 ms for 99 % is the bench's; a machine shared by many may take its time."""
+    """Bench tests the target of 0.1 ms for 99 %; these limits are for a loaded machine."""
     stamped, read = delays_ns(200)
     assert min(stamped) > -50_000
     assert sorted(stamped)[len(stamped) // 2] < 150_000
     assert sorted(stamped)[int(0.9 * len(stamped))] < 1_000_000
-    assert sorted(read)[int(0.9 * len(read))] > 1_000_000  # what Python would say
+    assert sorted(read)[int(0.9 * len(read))] > 1_000_000  # the time of the read
 
 
 # --- lines ------------------------------------------------------------------------------------

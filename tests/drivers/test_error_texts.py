@@ -1,4 +1,4 @@
-"""Every error of a driver states a remedy, and no id, which begins the line of the log anyway."""
+"""Every error of a driver states a remedy, without the id, which the log line starts with."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ ALL = [one for path in sorted(DRIVERS.rglob("*.py")) for one in errors_of(path)]
 
 @pytest.mark.parametrize(("place", "text"), ALL, ids=[place for place, _ in ALL])
 def test_an_error_states_object_finding_and_remedy(place: str, text: str) -> None:
-    # A text that ends in a value has its remedy in that value, as those of `_remedy` of a port.
+    # A text that ends in a value has its remedy in this value, for example from `_remedy`.
     assert REMEDY.search(text) or text.endswith((VALUE, f"{VALUE})")), (place, text)
     assert text.startswith((VALUE, "NatNet server ", "mocap.")), "it names the object first"
 

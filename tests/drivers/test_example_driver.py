@@ -1,4 +1,4 @@
-"""The example driver as a stranger's: installed, found by name, true to the contract."""
+"""The example driver as an installed package of another author passes the contract tests."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ EXAMPLE = ROOT / "examples" / "jointfit-example-driver"
 
 @pytest.fixture
 def installed(tmp_path: Path) -> dict[str, str]:
-    """Lay out what an installer makes of the project file, and return an environment that sees it.
+    """Write the metadata that an installer creates; return an environment that contains them.
 
-    Works offline and without the build backend; the real installation is a test of its own.
+    This works offline and without the build backend. Another test installs the package.
     """
     project = tomllib.loads((EXAMPLE / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     info = tmp_path / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
@@ -56,12 +56,12 @@ def python(environment: dict[str, str], *arguments: str) -> str:
 FIND = "from jointfit_daemon.driver import find_driver; print(find_driver('board').__qualname__)"
 
 
-def test_it_is_found_by_name_once_it_is_installed(installed: dict[str, str]) -> None:
+def test_the_installed_driver_is_found_by_name(installed: dict[str, str]) -> None:
     assert python(installed, "-c", FIND).strip() == "BoardImu"
 
 
 @pytest.mark.timeout(100)
-def test_it_passes_its_contract_and_its_own_tests(installed: dict[str, str]) -> None:
+def test_the_example_passes_the_contract_and_its_own_tests(installed: dict[str, str]) -> None:
     said = python(installed, "-m", "pytest", "-q", "-p", "no:cacheprovider")
     assert "skipped" not in said.splitlines()[-1]
 

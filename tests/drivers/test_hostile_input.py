@@ -1,4 +1,4 @@
-"""Whatever a wire carries, decoders and the clock behind them return, and quickly."""
+"""Decoders and the clock behind them process any bytes, without an error and in bounded time."""
 
 from __future__ import annotations
 

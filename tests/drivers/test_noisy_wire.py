@@ -1,4 +1,4 @@
-"""Damage on the wire is counted as damage: it makes no losses and no restarts of its own."""
+"""Damage on the wire is counted as corrupt bytes, and not as lost messages or restarts."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def with_flipped_bits(chance: random.Random, data: bytes) -> bytes:
 
 
 def with_damage_that_passes(chance: random.Random, number: int) -> bytes:
-    """Return a message of which every tenth is damaged, its checksum right one time in ten."""
+    """Return a message that is damaged in 10 % of the cases, of which 10 % pass the checksum."""
     data = bytearray(measurement(number))
     if chance.random() < 0.1:
         data[chance.randrange(4, len(data) - 1)] ^= 1 << chance.randrange(8)

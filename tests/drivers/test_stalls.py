@@ -59,9 +59,9 @@ def sampled(number: int, first_tick: int) -> int:
 def paused_sender(
     start: tuple[int, int], stall_ms: int, buffered: int, lost: int
 ) -> list[Received]:
-    """A sender that stops, then sends what it had sampled before, then goes on with the present.
+    """Return the messages of a sender that pauses, sends its buffer, and then continues.
 
-    Its counter counts the messages that it sent, and those lost.
+    The counter counts the messages that were sent, and `lost` further messages.
     """
     skipped = stall_ms * 1_000_000 // PERIOD_NS
     resumed_ns = (BEFORE + skipped) * PERIOD_NS
@@ -79,7 +79,7 @@ def paused_sender(
 def stalled_receiver(
     start: tuple[int, int], stall_ms: int, kept: int, resets_counter: int = 0
 ) -> list[Received]:
-    """A receiver that reads nothing for a while; its buffer holds `kept` messages."""
+    """Return the messages at a receiver that pauses; its buffer holds `kept` messages."""
     missed = stall_ms * 1_000_000 // PERIOD_NS
     resumed_ns = (BEFORE + missed) * PERIOD_NS
     stream: list[Received] = []

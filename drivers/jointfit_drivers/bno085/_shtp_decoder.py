@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from typing_extensions import override
 
 from jointfit_daemon.model import DeviceEvent, ImuSample
-from jointfit_drivers.gateway_orientation import RawReading, RawStamp, is_plausible
+from jointfit_drivers.gateway_orientation import RawReading, RawStamp
 from jointfit_drivers.newer_firmware import NewerFirmwareDetector, NewestKnown
 from jointfit_drivers.refusals import Refusals
 from jointfit_drivers.serial_decoder import SerialMessageDecoder
@@ -240,8 +240,6 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
             _vector(self._force),
             _vector(self._field) if raw.magnetometer and self._field is not None else None,
         )
-        if not is_plausible(reading):
-            return out
         clipped = any(abs(v) >= _SATURATED * _RATE_COUNT for v in reading.rate)
         clipped |= any(abs(v) >= _SATURATED * _FORCE_COUNT for v in reading.force)
         stamp = RawStamp(self._arrival_ns, None, report.sequence, report.status)

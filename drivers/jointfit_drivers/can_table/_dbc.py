@@ -123,6 +123,12 @@ def _signal(name: str, path: str, stamp: int) -> DbcSignal:
         raise FieldFaultError("signals", text)
 
     message, signal = found[0]
+    if signal.is_signed and signal.length == 1:
+        text = (
+            f"{message.name}.{signal_name} is signed and has 1 bit, so it can only be 0 or -1: "
+            "declare it as unsigned (+) in the DBC file"
+        )
+        raise FieldFaultError("signals", text)
     unit = _UNITS.get((signal.unit or "").strip())
     key = (message.frame_id, bool(message.is_extended_frame))
     return DbcSignal(key, _place(signal), unit, _multiplexer(message, signal))

@@ -105,7 +105,8 @@ class LpmsOrientation:
         norm = self._gate.misconfigured_norm
         if norm is not None:
             text = f"median quaternion norm is {norm:.4g}, expected 1: {self.remedy}"
-            self.events.append(DeviceEvent("warning", text, {"median_norm": norm}))
+            data = {"median_norm": norm} if isfinite(norm) else {}
+            self.events.append(DeviceEvent("warning", text, data))
             return
         known = [norm for norm in self._norms if isfinite(norm)]
         low, middle, high = min(known), median(known), max(known)

@@ -19,8 +19,13 @@ from jointfit_drivers.natnet._binding import bind_model
 from jointfit_drivers.natnet._bitstream import FRAME_START, BitstreamTracker
 from jointfit_drivers.natnet._frame_time import FrameTime
 from jointfit_drivers.natnet._poses import PoseConverter
-from jointfit_drivers.natnet._server_checks import bitstream_response, same_instance, usable_hz
-from jointfit_drivers.newer_firmware import NewerFirmwareDetector, NewestKnown
+from jointfit_drivers.natnet._server_checks import (
+    NEWEST,
+    bitstream_response,
+    same_instance,
+    usable_hz,
+)
+from jointfit_drivers.newer_firmware import NewerFirmwareDetector
 from jointfit_protocols import natnet
 from jointfit_protocols.corrupt import CorruptBytes
 
@@ -32,9 +37,6 @@ if TYPE_CHECKING:
 _ECHO_LIMIT_NS = 10**9
 """Largest round-trip time of an echo that is used for the clock, ns."""
 _PENDING_ECHOES = 8
-_NEWEST = NewestKnown((4, 2), "Motive", "NatNet")
-"""Newest bitstream version with a published description. Sections of later versions are skipped by
-their size."""
 _NAMED_UNKNOWN = 16
 """Largest number of unknown ids in warnings. Further ids are only counted."""
 _MOST_SECONDS = 2**63 // 10**9
@@ -58,7 +60,7 @@ class NatNetDecoder:
         self._bitstream = BitstreamTracker(settings.wanted_version)
         self._latency_ms = settings.latency_ms
         self._time = FrameTime(settings)
-        self._newer = NewerFirmwareDetector(_NEWEST, sightings=1)
+        self._newer = NewerFirmwareDetector(NEWEST, sightings=1)
         self._wanted_markers, self._wanted_bodies = wanted_names(settings)
         self._poses = PoseConverter(settings.up_axis)
         self._continuity = FrameContinuity()

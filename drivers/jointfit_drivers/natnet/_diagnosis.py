@@ -31,7 +31,7 @@ from jointfit_drivers.motion_capture import (
 from jointfit_drivers.natnet._bitstream import FRAME_START
 from jointfit_drivers.natnet._decoder import NatNetDecoder
 from jointfit_drivers.natnet._network_findings import card_findings, multicast_arrivals
-from jointfit_drivers.natnet._server_checks import NEWEST_MAJOR
+from jointfit_drivers.natnet._server_checks import NEWEST
 from jointfit_drivers.natnet._session import CONNECT_S, MODEL_S, NatNetSession
 from jointfit_drivers.ports.network_cards import network_cards
 from jointfit_drivers.ports.udp_socket import local_address
@@ -44,8 +44,6 @@ if TYPE_CHECKING:
 
 _MULTICAST_S = 1.0
 """Duration of the reception of multicast frames at all network cards, s."""
-_NEWEST = "4.2"
-"""Newest bitstream version with a published description."""
 _STILL = 3
 """Number of repeated frame numbers from which the frames count as paused."""
 _STREAMING = (
@@ -147,8 +145,9 @@ async def _missing_frames(
     major = int(natnet.partition(".")[0])
     oldest = ".".join(map(str, OLDEST))
 
-    if major > NEWEST_MAJOR or (reception.datagrams and major >= NEWEST_MAJOR):
-        text = f"the server streams bitstream {natnet}, the newest known version is {_NEWEST}"
+    newest = NEWEST.version[0]
+    if major > newest or (reception.datagrams and major >= newest):
+        text = f"the server streams bitstream {natnet}, the newest known version is {NEWEST.text}"
         remedy = 'switch Motive to unicast, and set bitstream = "4.1" in [mocap]'
         return [Finding(CHECK, name, "error", text, remedy)]
     if tuple(map(int, natnet.split("."))) < OLDEST:

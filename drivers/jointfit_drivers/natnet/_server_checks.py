@@ -9,13 +9,16 @@ from ipaddress import IPv4Address
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.driver import DeviceMisconfiguredError
+from jointfit_drivers.newer_firmware import NewestKnown
 from jointfit_protocols.natnet import OLDEST, TICKED, Connect, is_supported
 
 if TYPE_CHECKING:
     from jointfit_drivers.natnet._settings import NatNetSettings
     from jointfit_protocols.natnet import ServerInfo, Version
 
-NEWEST_MAJOR = 4
+NEWEST = NewestKnown((4, 2), "Motive", "NatNet")
+"""Newest bitstream version with a published description. Sections of later versions are skipped by
+their size."""
 LEAST_CLOCK_HZ = 1_000
 """Lowest usable frequency of the server's counter, Hz. A slower counter stamps too coarsely."""
 MOST_CLOCK_HZ = 100_000_000_000
@@ -73,7 +76,7 @@ def check_server(name: str, settings: NatNetSettings, info: ServerInfo) -> None:
             f"expected {LEAST_CLOCK_HZ} to {MOST_CLOCK_HZ}: "
             "check that server and command_port lead to Motive"
         )
-    if info.bitstream[0] > NEWEST_MAJOR and settings.wanted_version is None:
+    if info.bitstream[0] > NEWEST.version[0] and settings.wanted_version is None:
         raise DeviceMisconfiguredError(
             f"{found}, which is newer than this driver:"
             " switch Motive to unicast and set bitstream = '4.1'"

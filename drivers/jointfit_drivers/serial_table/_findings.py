@@ -94,11 +94,35 @@ def _explain_frames(data: bytes, wire: FrameFormat) -> str:
     distances = Counter(after - before for before, after in pairwise(starts))
     spacing, times = distances.most_common(1)[0]
     regular = times >= _SHARE * len(starts)
-    if regular:
-        finding = _length_finding(data, starts, spacing, wire)
-        if finding is not None:
-            return finding
     frames = [data[a:b] for a, b in pairwise(starts) if b - a == spacing]
+    finding = None
+    if regular:
+        finding = _length_finding(data, starts, spacing, wire) or _end_finding(frames, wire)
+    finding = finding or _content_finding(frames, wire)
+    if finding is not None:
+        return finding
+
+    if regular:
+        return (
+            f"sync bytes {sync} follow each other after {spacing} bytes, but the frames do not fit "
+            "the table: correct the positions of the fields, or `frame.sync` and length"
+        )
+    return (
+        f"sync bytes {sync} have no regular distance, most often {spacing} bytes: correct "
+        "`frame.sync` and length"
+    )
+
+
+def _end_finding(frames: Sequence[bytes], wire: FrameFormat) -> str | None:
+    """Return that frames of equal length do not end as expected; None if they do."""
+    if sum(frame.endswith(wire.end) for frame in frames) >= _SHARE * len(frames):
+        return None
+    end = wire.end.hex(" ").upper()
+    return f"frames of {len(frames[0])} bytes do not end with {end}: correct `frame.end`"
+
+
+def _content_finding(frames: Sequence[bytes], wire: FrameFormat) -> str | None:
+    """Return the difference in checksum or type of frames of equal length; None without one."""
     valid = 0
     if wire.checksum is not None:
         valid = sum(_is_valid(frame, wire.checksum, wire) for frame in frames)
@@ -107,9 +131,8 @@ def _explain_frames(data: bytes, wire: FrameFormat) -> str:
         fits = (one for one in usual if all(_is_valid(frame, one, wire) for frame in frames))
         fitting = next(fits, None)
         known = "" if fitting is None else f"; the data fit {_checksum_keys(fitting)}"
-        return (
-            f"no checksum of frames with {spacing} bytes is valid{known}: correct `frame.checksum`"
-        )
+        size = len(frames[0])
+        return f"no checksum of frames with {size} bytes is valid{known}: correct `frame.checksum`"
     if wire.message is not None:
         read = FieldReader([wire.message[0]])
         values = {int(read.read(frame, 0)[0]) for frame in frames if len(frame) >= read.size}
@@ -117,7 +140,7 @@ def _explain_frames(data: bytes, wire: FrameFormat) -> str:
             shown = ", ".join(map(str, sorted(values)[:_NAMED]))
             expected = f"expected {wire.message[1]}"
             return f"frames have the type {shown}, {expected}: correct `frame.message.equals`"
-    return f"no frame follows another one after {spacing} bytes: correct `frame.sync` and length"
+    return None
 
 
 def _length_finding(

@@ -13,6 +13,7 @@ Invariant: the output depends only on the chunks fed. The decoder reads no clock
 from __future__ import annotations
 
 from collections.abc import Mapping  # noqa: TC003 - mypyc evaluates the types of fields
+from math import isfinite
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, SyncPulse, TickClock
@@ -309,7 +310,8 @@ class XbusDecoder:
             modulus = self.tick_clock.modulus or setup.WRAP_32_BIT
             found = self._raw.samples(fields, values, modulus)
             if found is None:
-                return [*pulses, self._refuse(message, "raw measurements out of range")]
+                reason = "raw measurements out of range, or with the time of the previous ones"
+                return [*pulses, self._refuse(message, reason)]
             return pulses + found
 
         native: Quaternion = values[_QUATERNION]
@@ -328,7 +330,8 @@ class XbusDecoder:
             if norm is not None:
                 text = f"median quaternion norm is {norm:.4g}, expected 1"
                 text += ": byte order or scale is wrong"
-                out.append(DeviceEvent("warning", text, {"median_norm": norm}))
+                data = {"median_norm": norm} if isfinite(norm) else {}
+                out.append(DeviceEvent("warning", text, data))
         return out
 
     def _forget_orientation(self) -> None:

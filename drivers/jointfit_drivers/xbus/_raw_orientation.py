@@ -57,7 +57,10 @@ class RawOrientation:
     def samples(
         self, stamp: RawStamp, values: Mapping[int, object], modulus: int
     ) -> list[Decoded] | None:
-        """Return warnings and samples of a complete message; None if it is not plausible."""
+        """Return warnings and samples of a complete message; None if it is not plausible.
+
+        A message with the time of the previous message is not plausible either.
+        """
         ticks = stamp.ticks
         if ticks is None or ticks == self._ticks:
             return None

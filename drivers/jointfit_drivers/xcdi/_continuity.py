@@ -63,7 +63,7 @@ class XcdiStep(NamedTuple):
     """Classification of one group."""
 
     lost: int = 0
-    """Number of groups lost since the last accepted group; a held group is not lost."""
+    """Number of groups lost before this group, or before the held group if it is confirmed."""
     restarted: bool = False
     """Whether the sensor restarted before the held group."""
     shared: bool = False
@@ -72,6 +72,8 @@ class XcdiStep(NamedTuple):
     """Whether this group must be held until the next group."""
     confirmed: bool = False
     """Whether the held group is valid and must be returned first; otherwise it is dropped."""
+    lost_since: int = 0
+    """Number of groups lost between the confirmed group and this group."""
 
 
 _CONTINUES = XcdiStep()
@@ -144,9 +146,10 @@ class XcdiContinuity:
             restarted = groups is None and settled and not self._track.ran_on_to(held)
             if not restarted:
                 held.delay = self._track.delay_to(held)
-            lost = held.take(ticks, counter, host) + (groups or 1) - 1
+            lost, since = (groups or 1) - 1, held.take(ticks, counter, host)
             self._track, self._rival = held, None
-            return XcdiStep(lost, restarted=restarted, confirmed=True), False
+            step = XcdiStep(lost, restarted=restarted, confirmed=True, lost_since=since)
+            return step, False
 
         self._astray += 1
         rival = self._rival

@@ -141,10 +141,10 @@ class XcdiDecoder:
             self._unit.restart()
             out.append(DeviceEvent("restart", f"device clock restarted at {first.ticks} ticks"))
 
+        out += _gap(step.lost)
         if first is not group:
             self._sample(first, out)
-        if step.lost:
-            out.append(DeviceEvent("gap", f"{step.lost} groups lost", {"lost": step.lost}))
+            out += _gap(step.lost_since)
         self._sample(group, out)
 
     def _drop_held(self, out: list[Decoded]) -> None:
@@ -224,6 +224,10 @@ class XcdiDecoder:
         """Discard the quaternion frame that was just decoded."""
         self._refused += 1
         out.append(self._bus.discard(can.RECORD_BYTES, reason, rejected=1))
+
+
+def _gap(lost: int) -> list[Decoded]:
+    return [DeviceEvent("gap", f"{lost} groups lost", {"lost": lost})] if lost else []
 
 
 def _native(group: XcdiGroup) -> Quaternion:

@@ -12,6 +12,7 @@ Invariant: the output depends only on the chunks fed. The decoder reads no clock
 
 from __future__ import annotations
 
+from math import isfinite
 from typing import TYPE_CHECKING, NamedTuple
 
 from typing_extensions import override
@@ -158,7 +159,8 @@ class XImu3Decoder(SerialMessageDecoder[XImu3Data | XImu3Reply]):
                     self._norm_checked = True
                     text = f"median quaternion norm is {norm:.4g}, expected 1"
                     text += ": order or scale is wrong"
-                    out.append(DeviceEvent("warning", text, {"median_norm": norm}))
+                    data = {"median_norm": norm} if isfinite(norm) else {}
+                    out.append(DeviceEvent("warning", text, data))
                 return out
 
         arrived_ns = self._arrival_of(message)

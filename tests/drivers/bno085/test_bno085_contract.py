@@ -94,7 +94,7 @@ class TestBno085Raw(TestBno085Shtp):
 
     @override
     def matches(self, number: int, measurement: Any) -> bool:
-        """By the acceleration: the orientation depends on all readings before."""
+        """Compare the acceleration, because the orientation depends on all earlier readings."""
         inertial = InertialSignals()
         inertial.update(0, orientation(number))
         force = inertial.value(Item.ACCELERATION)

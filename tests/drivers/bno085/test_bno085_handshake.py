@@ -1,4 +1,4 @@
-"""The BNO085 driver with devices of either mode, and what it sets in them."""
+"""The BNO085 driver with devices in both modes, and the settings that the driver changes."""
 
 from __future__ import annotations
 

@@ -65,6 +65,6 @@ class TestOneFrameOnABusWithoutDescriptor(DriverContract):
     def make_driver(self, folder: Path) -> Driver:
         return CanTableImu(can_settings("virtual", str(folder), ONE_FRAME))
 
-    # An in-process bus has no noise, and anything at all may share it.
+    # An in-process bus has no noise, and devices of any kind may use it.
     test_line_noise_affects_only_damaged_samples = None  # type: ignore[assignment]
     test_wrong_device_raises_device_misconfigured = None  # type: ignore[assignment]

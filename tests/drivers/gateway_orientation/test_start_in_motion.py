@@ -1,4 +1,4 @@
-"""An IMU that starts in motion: orientation, gyroscope bias, and what the filter states of them."""
+"""An IMU that starts in motion: errors of orientation and gyroscope bias, and stated deviation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 pytest.importorskip("vqf")
 RATE_HZ = 100
 FINE = 10
-"""Steps of the simulated movement per reading."""
+"""Number of simulation steps per reading."""
 SEEDS = range(6)
 
 
@@ -33,7 +33,7 @@ class MovingSensor:
 
 @dataclass(frozen=True)
 class Run:
-    """Output of the filter, NaN where there is none, and its stated bias."""
+    """Errors of the filter, NaN where it has no output, and stated deviation of the bias."""
 
     error_deg: Array
     bias_error: Array
@@ -45,7 +45,7 @@ class Run:
 def sensor(
     seed: int, *, speed: float = 0.3, rest_s: float = 0.0, seconds: float = 14.0
 ) -> MovingSensor:
-    """Simulate a sensor that turns by some 50 degrees and moves; at the end it rests."""
+    """Simulate a sensor that rotates by about 50 degrees and moves, with a rest at the end."""
     rng = np.random.default_rng(seed)
     t_s = np.arange(round(seconds * RATE_HZ) * FINE) / (RATE_HZ * FINE)
     moving = 1.0 / (1.0 + np.exp((t_s - (seconds - rest_s)) / 0.1)) if rest_s else np.ones(len(t_s))

@@ -37,7 +37,7 @@ def settings(
 
 
 class TestLpmsInCanopenStyle(DriverContract):
-    """16 bits, all four frames, heartbeat."""
+    """Integers of 16 bits, all four frames, and a heartbeat."""
 
     registered_as = "lpms-can"
     numbers = tpdo_ids(1)
@@ -55,7 +55,7 @@ class TestLpmsInCanopenStyle(DriverContract):
     @override
     def make_driver(self, folder: Path) -> Driver:
         path = str(folder / "adapter")
-        # the suite sends every 2 ms: halves of neighbouring samples are further apart than 1 ms
+        # The suite sends a sample every 2 ms. The driver joins frames within half a period.
         more = {"rate_hz": 500}
         return LpmsCanImu(settings("slcan", path, self.numbers, self.mode, self.precision, **more))
 
@@ -65,7 +65,7 @@ class TestLpmsInCanopenStyle(DriverContract):
 
 
 class TestLpmsInSequentialMode(TestLpmsInCanopenStyle):
-    """32 bits, one rule of identifiers, without idle frames."""
+    """Floats of 32 bits, adjacent identifiers, and no idle frames."""
 
     numbers = sequential_ids(1, spaced=False)
     mode, precision = "sequential", "float32"
@@ -84,15 +84,15 @@ class TestLpmsInSequentialMode(TestLpmsInCanopenStyle):
     def matches(self, number: int, measurement: Any) -> bool:
         """Return whether `measurement` is a sample, within 0.09 rad.
 
-        The line of an adapter has no checksum: a wrong digit of a small component changes the norm
-        by less than the gate's 1 %, and the orientation by less than the distance of two samples.
+        The line of an adapter has no checksum. A wrong digit of a small component changes the norm
+        by less than 1 %, which is accepted, and the orientation by less than 0.09 rad.
         """
         products = zip(orientation(number), measurement.q_world_sensor, strict=True)
         return bool(abs(sum(a * b for a, b in products)) > 1 - 1e-3)
 
 
 class TestLpmsOfOldFirmwareOnABusWithoutDescriptor(DriverContract):
-    """Thousandths, the other rule of identifiers, in one process."""
+    """Values in thousandths, and spaced identifiers, on an in-process bus."""
 
     registered_as = "lpms-can"
     has_noise = False

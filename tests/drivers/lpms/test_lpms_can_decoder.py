@@ -296,7 +296,7 @@ async def test_four_sensors_share_a_bus(tmp_path: Path) -> None:
     wire.unplug()
 
 
-def test_ids_are_frozen() -> None:
+def test_ids_are_immutable() -> None:
     ids = LpmsCanIdSettings(frame1=1, frame2=2, frame3=3, frame4=4)
     with pytest.raises(ValidationError):
         ids.frame1 = 5  # type: ignore[misc]

@@ -46,7 +46,7 @@ class TestLpmsOfGeneration3(DriverContract):
 class TestLpmsOfGeneration1(TestLpmsOfGeneration3):
     """Old firmware: thousandths in 16 bits, no acknowledgements, already configured."""
 
-    # Without acknowledgements every connection waits for them in vain.
+    # Every connection waits for acknowledgements that this firmware does not send.
     starts_within_s = 15.0
 
     @override
@@ -68,7 +68,7 @@ class TestLpmsOfGeneration1(TestLpmsOfGeneration3):
 
 
 class TestLpmsWithLongAddressAndOtherConvention(TestLpmsOfGeneration3):
-    """Sums of words, sensor to world in ENU, in command mode at the start."""
+    """Checksum over words, orientation from sensor to ENU, and command mode at the start."""
 
     @override
     def make_device(self, folder: Path, wire_noise: WireNoise) -> LpmsDevice:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import struct
 from itertools import pairwise
 from random import Random
@@ -302,6 +303,15 @@ def test_text_and_another_address_are_reported_once() -> None:
 def test_the_norm_of_a_sound_stream_is_published() -> None:
     found = fed(decoder(), [packet(n) for n in range(120)])
     assert texts(found, "info") == ["norm of the first 100 quaternions: 1.00000 to 1.00000"]
+
+
+def test_the_norm_of_a_stream_without_numbers_is_not_published() -> None:
+    layout = PacketLayout(TABLES[3], TABLES[3].quaternion)
+    packets = [layout.encode(5 * n, [math.nan] * 4, floats=True) for n in range(120)]
+    found = fed(decoder(), [encode(LpmsCommand.DATA, data) for data in packets])
+    (warning,) = (e for e in found if isinstance(e, DeviceEvent) and e.kind == "warning")
+    assert warning.text.startswith("median quaternion norm is nan, expected 1: ")
+    assert warning.data == {}
 
 
 @given(st.lists(st.binary(max_size=60).map(lambda data: encode(9, data)) | st.binary(), max_size=9))

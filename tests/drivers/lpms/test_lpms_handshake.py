@@ -1,4 +1,4 @@
-"""The handshake of LPMS sensors: commands that are read, set and never sent, and errors."""
+"""The handshake of LPMS sensors: settings that are read and changed, and errors."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ def server(*markers: str, **options: Any) -> LslServer:
 
 
 class Reading:
-    """A driver at work, with one decoder over all connections as in the daemon."""
+    """A running driver, with one decoder for all connections, as in the daemon."""
 
     def __init__(self, **keys: Any) -> None:
         self.driver = LslMarkersMocap(settings(**keys))
@@ -63,7 +63,7 @@ class Reading:
             await asyncio.wait([running])
 
     async def frames(self, source: LslServer, count: int, kind: type = MocapFrame) -> None:
-        """Send until so many items more have arrived."""
+        """Send until this number of further items has arrived."""
         wanted = len(self.of(kind)) + count
         async with asyncio.timeout(10):
             while len(self.of(kind)) < wanted:

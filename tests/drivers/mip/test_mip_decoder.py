@@ -161,6 +161,27 @@ def test_a_refused_command_is_reported_and_an_unknown_one_is_not() -> None:
     ]
 
 
+def test_a_raw_reading_that_is_refused_has_its_own_reason() -> None:
+    pytest.importorskip("vqf")
+    times = [0, PERIOD_NS, PERIOD_NS, 2 * PERIOD_NS]
+    wires = [
+        encode(
+            0x80,
+            (
+                encode_field(0x80, 0xD5, t_ns),
+                encode_field(0x80, 4, 0.0, 0.0, 1.0),
+                encode_field(0x80, 5, 0.0, 0.0, 900.0 if number == 3 else 0.0),
+            ),
+        )
+        for number, t_ns in enumerate(times)
+    ]
+    found = decoded(wires, orientation="gateway", settle_s=0.0)
+    assert [one.reason for one in found if isinstance(one, Corrupt)] == [
+        "raw measurements with the time of the previous ones",
+        "raw measurements out of range",
+    ]
+
+
 def test_raw_measurements_are_in_si_units() -> None:
     pytest.importorskip("vqf")
     signals = InertialSignals()

@@ -47,7 +47,7 @@ async def test_a_device_that_is_right_is_not_written_to(tmp_path: Path) -> None:
     first, *_ = run.events
     known = {key for one in run.events if isinstance(one, DeviceEvent) for key in one.data}
     assert {"model", "serial", "firmware", "sensor_to_vehicle", "outputs_0x82"} <= known
-    assert isinstance(first, DeviceEvent), "nothing of before the acknowledgement"
+    assert isinstance(first, DeviceEvent), "a packet from before the acknowledgement"
 
 
 @pytest.mark.parametrize("family", ["current", "legacy"])

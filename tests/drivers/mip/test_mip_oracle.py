@@ -1,4 +1,4 @@
-"""The vendor's library reads the packets of the virtual device as we do."""
+"""The vendor's library reads the same values from the packets of the virtual device."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the contract tests of all motion-capture drivers share."""
+"""Common base of the contract tests of all motion-capture drivers."""
 
 from __future__ import annotations
 

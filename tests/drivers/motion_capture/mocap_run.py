@@ -1,4 +1,4 @@
-"""Servers and drivers of motion capture at work, as several families test them."""
+"""Helpers that run motion-capture servers and drivers, for tests of several families."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @contextlib.asynccontextmanager
 async def answering(server: Any, push: Callable[[], object] | None) -> AsyncIterator[None]:
-    """Run a server, and call `push` every 10 ms, unless it is None; unplug it in the end."""
+    """Run a server, and unplug it at the end; call `push`, if given, every 10 ms."""
 
     async def send() -> None:
         while push is not None:
@@ -37,7 +37,7 @@ async def answering(server: Any, push: Callable[[], object] | None) -> AsyncIter
 
 
 class MocapRun:
-    """A driver at work and the output of its decoder."""
+    """A running driver, and the output of its decoder."""
 
     def __init__(self, driver: Driver) -> None:
         self.driver = driver

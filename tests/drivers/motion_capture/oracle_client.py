@@ -1,6 +1,6 @@
-"""An independent C++ client of motion-capture servers, in a child process that is ended.
+"""An independent C++ client of motion-capture servers, in a child process.
 
-It blocks in its library and has no clean shutdown.
+The client blocks in its library, so the process is killed at the end.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ def test_after_a_connection_without_a_frame_answers_wait_for_the_first_frame() -
     for _ in range(3):
         output.begin(emitted.append)
         output.emit_answer(ANSWER)
-    assert emitted == [ANSWER]  # that of the first connection
+    assert emitted == [ANSWER]  # the answer of the first connection
     output.emit_frame(FRAME)
     assert emitted == [ANSWER, ANSWER, FRAME]
 

@@ -1,4 +1,4 @@
-"""Feeds messages to a NatNet decoder; a small model and short ways to write frames."""
+"""A NatNet decoder for tests, a small model, and functions that return its frames."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def frame(number: int, **parts: Any) -> FrameOfData:
 
 
 class Feeder:
-    """A decoder and what it said."""
+    """A decoder and its output."""
 
     def __init__(
         self, *, up_axis: str = "z", version: tuple[int, int] = (3, 0), **settings: Any

@@ -27,7 +27,7 @@ from tests.drivers.natnet.feeder import (
 )
 
 
-def test_columns_are_named_and_their_order_follows_no_id() -> None:
+def test_columns_are_named_and_their_order_does_not_depend_on_ids() -> None:
     got = ready().frame(frame(1, markers=(marker(2 << 16 | 1, (1.0, 0.0, 0.0)),)))
     assert got.layout.markers == ("T1", "T2", "T3", "S1", "S2")
     assert got.layout.bodies == ("Thigh", "Shank")
@@ -163,7 +163,7 @@ def test_identifiers_outside_the_model_are_dropped_counted_and_reported_once() -
         1, markers=(marker(9 << 16 | 1, (1.0, 1.0, 1.0)), marker(77, (1.0, 1.0, 1.0), 18))
     )
     feeder(strange, strange._replace(number=2))
-    assert feeder.decoder.unknown_ids == 2  # the one of model 0 is nobody's: not counted
+    assert feeder.decoder.unknown_ids == 2  # model 0 is no model, so its marker is not counted
     (warning,) = told(feeder.events, "warning")
     assert "9:1" in warning.text
 

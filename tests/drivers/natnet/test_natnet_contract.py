@@ -20,7 +20,7 @@ pytestmark = pytest.mark.real_time
 
 
 class ForeignUdpServer:
-    """Answers every datagram, in a language that is not NatNet."""
+    """Answers every datagram with a message that is not NatNet."""
 
     def __init__(self) -> None:
         self._port = NatNetPort()

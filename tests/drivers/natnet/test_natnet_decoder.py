@@ -48,7 +48,7 @@ from tests.drivers.natnet.feeder import (
 if TYPE_CHECKING:
     from pathlib import Path
 
-# --- what was not seen ------------------------------------------------------------------------
+# --- occlusion --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("params", [11, 8, 9, 12, 4])
@@ -194,7 +194,7 @@ def test_another_server_in_its_place_is_a_restart_without_names() -> None:
     assert feeder(INFO._replace(clock_hz=3_312_787)) == []
 
 
-# --- what the server says ---------------------------------------------------------------------
+# --- announcements of the server --------------------------------------------------------------
 
 
 def test_frames_before_the_model_are_counted_and_not_published() -> None:

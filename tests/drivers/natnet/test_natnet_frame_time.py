@@ -47,14 +47,14 @@ def every_third_of_a_second(unit: int) -> list[tuple[int, int]]:
     return [(SECONDS + k // 3, k % 3 * unit // 3) for k in range(FRAMES)]
 
 
-def test_fractions_are_read_in_the_unit_they_prove() -> None:
+def test_the_unit_of_time_fractions_is_detected() -> None:
     for unit in (NS, 2**32):
         found = frames_of(streamed(every_third_of_a_second(unit), time="utc"))
         ticks = [f.ticks for f in found if f.ticks is not None]
         true = [SECONDS * NS + k * NS // 3 for k in range(FRAMES)][-len(ticks) :]
         assert all(abs(a - b) <= 1 for a, b in zip(ticks, true, strict=True))
         assert len(ticks) >= FRAMES - DECIDING + 1
-        assert len(ticks) > FRAMES - 4 or unit == NS  # 2^-32 s proves itself at once
+        assert len(ticks) > FRAMES - 4 or unit == NS  # 2^-32 s is known early
 
 
 def test_a_clock_on_ptp_is_unix_time_less_the_leap_seconds() -> None:
@@ -85,7 +85,7 @@ def test_echoes_of_the_servers_counter_do_not_reach_a_clock_on_ptp() -> None:
         assert sum(isinstance(event, ClockEcho) for event in feeder.events) == echoes
 
 
-def test_by_default_the_servers_counter_counts() -> None:
+def test_by_default_the_servers_counter_is_the_clock() -> None:
     feeder = streamed(every_third_of_a_second(NS))
     assert [found.ticks for found in frames_of(feeder)][:2] == [1000, 2000]
     assert feeder.decoder.tick_clock == TickClock(0, None, INFO.clock_hz)

@@ -1,6 +1,6 @@
-"""A real NatNet capture gives every figure of time that two other parsers found in it.
+"""Times in a real NatNet capture equal the values that two other parsers found.
 
-Expected values come with the recording; arrivals are the packet times of the file.
+The expected values come with the recording. Arrivals are the packet times of the file.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MS = 1e-6  # ns to ms
 
 
 class Traffic(NamedTuple):
-    """What the capture holds."""
+    """Content of the capture."""
 
     frames: list[tuple[int, FrameOfData]]
     """Arrival, ns, and frame."""
@@ -152,7 +152,7 @@ def test_by_the_quickest_echo_frames_travel_their_known_times(traffic: Traffic) 
     ):
         said = (found[0], np.median(found), np.percentile(found, 99), found[-1])
         assert said == pytest.approx(expected, abs=0.02)
-    assert (transit > 2.01).sum() == 1  # another one is at 2.003
+    assert (transit > 2.01).sum() == 1  # the next smaller value is 2.003
 
 
 def test_lost_and_late_echoes_leave_the_offset_where_it_was(traffic: Traffic) -> None:
@@ -178,5 +178,7 @@ def test_lost_and_late_echoes_leave_the_offset_where_it_was(traffic: Traffic) ->
             )
     at_middle, at_last = np.array(moved).T
     assert np.percentile(at_middle, 99) <= 50_000
-    assert at_middle.max() <= 60_000  # where three of the four good ones left are neighbours
-    assert np.percentile(at_last, 95) <= 50_000  # not where all that is left came long before
+    # The error is largest if three of the four remaining punctual echoes are neighbours.
+    assert at_middle.max() <= 60_000
+    # The error is larger if all remaining punctual echoes are long before the last one.
+    assert np.percentile(at_last, 95) <= 50_000

@@ -178,7 +178,7 @@ async def test_a_library_that_hangs_is_called_by_one_thread_only_and_its_late_bu
         "check its [can] table; retrying as soon as the library of the bus returns"
     }
     assert len(calls) == 1
-    assert calls[0].daemon, "the end of the process would wait for it"
+    assert calls[0].daemon, "the exit of the process would wait for this thread"
     released.set()
     assert closed.wait(5.0)
     calls[0].join()

@@ -70,7 +70,7 @@ async def test_two_sensors_on_one_adapter_each_get_their_own(tmp_path: Path) -> 
         assert adapter.is_open, "the bus stays open for the other"
         await runs[1].cancel()
         await asyncio.sleep(0.05)
-        assert not adapter.is_open, "the last one out closes it"
+        assert not adapter.is_open, "the last user closes the bus"
 
 
 class Eager(SlcanAdapter):
@@ -110,7 +110,7 @@ async def test_slcan_bus_delivers_frames_that_come_with_the_answer_to_open(tmp_p
     assert [sample.counter for sample in run.samples] == [0, 1]
 
 
-async def test_an_unplugged_adapter_loses_all_and_gives_all_back(tmp_path: Path) -> None:
+async def test_all_sensors_of_an_unplugged_adapter_are_lost_and_return(tmp_path: Path) -> None:
     adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
     devices = two_sensors(adapter)
     drivers = [xcdi_driver("S3", bus, 0x100), xcdi_driver("S4", bus, 0x200)]
@@ -329,7 +329,7 @@ async def test_lost_bytes_of_a_line_are_counted_by_one_device_only(tmp_path: Pat
             await run.cancel()
 
 
-async def test_a_bug_behind_one_device_hurts_no_other(tmp_path: Path) -> None:
+async def test_a_bug_of_one_device_does_not_affect_other_devices(tmp_path: Path) -> None:
     adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
     devices = two_sensors(adapter)
 
@@ -377,7 +377,7 @@ async def test_an_adapter_left_streaming_by_a_crash_is_taken_over(tmp_path: Path
         await opened(adapter)
         device.push(50 * 10_000_000, IDENTITY)
         await run.wait_for(1)
-        assert [each.counter for each in run.samples] == [50], "nothing stale"
+        assert [each.counter for each in run.samples] == [50], "a stale frame"
         await run.cancel()
 
 
@@ -394,7 +394,7 @@ class Chatter:
             await asyncio.sleep(0.02)
 
 
-async def test_a_device_that_talks_something_else_is_named(tmp_path: Path) -> None:
+async def test_a_device_with_another_protocol_is_named(tmp_path: Path) -> None:
     async with serving(Chatter(tmp_path / "adapter")):
         with pytest.raises(DeviceMisconfiguredError, match="no SLCAN adapter found at 115200 baud"):
             await xcdi_driver("S3", bus_at(tmp_path)).run(lambda _: None)

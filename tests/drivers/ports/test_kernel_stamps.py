@@ -22,7 +22,7 @@ class Clocks:
 
 
 def stamped(clocks: Clocks, stamps: KernelStamps, ago_ns: int, offset: int | None = None) -> int:
-    """Return how long ago the frame seems to have ended, ns, when it did `ago_ns` ago."""
+    """Return the time since the end of a frame by its stamp, ns; the true time is `ago_ns`."""
     unix = clocks.monotonic - ago_ns + (clocks.offset if offset is None else offset)
     start = stamps.start_ns(unix / S, 8, extended=False)
     return clocks.monotonic - start - frame_bits(8, extended=False) * 1000
@@ -44,7 +44,7 @@ def test_a_stepped_wall_clock_moves_no_frame(step_s: float) -> None:
     clocks.offset += round(step_s * S)
     clocks.monotonic += 1_000_000
     stamps.pair()
-    if abs(step_s) > 2:  # a small one cannot be told for frames that waited
+    if abs(step_s) > 2:  # a small step has the same effect as a wait of the frame
         assert stamped(clocks, stamps, 500_000, before) == pytest.approx(500_000, abs=300)
     assert stamped(clocks, stamps, 200_000) == pytest.approx(200_000, abs=300)
     assert stamps.replaced == 0

@@ -155,7 +155,7 @@ async def test_kernels_without_can_and_absent_links(
 
 
 class Filtered(can.BusABC):
-    """SocketCAN as far as one test needs it: a descriptor, stamps, and an error told once."""
+    """Replacement for SocketCAN with a descriptor, stamps, and an error when the link is down."""
 
     def __init__(self, **_: Any) -> None:
         self.socket, self.far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)

@@ -1,4 +1,4 @@
-"""Serial ports on ptys: what is read, what is written, and how it ends."""
+"""Serial ports on ptys: reading, writing, and the end of a connection."""
 
 from __future__ import annotations
 
@@ -123,13 +123,13 @@ async def test_receive_returns_a_chunk_or_none(pty: Pty) -> None:
         assert chunk is not None
         assert chunk.data == b"one"
         os.write(pty.master, b"two")
-        await asyncio.sleep(0.02)  # nobody reads: it waits
+        await asyncio.sleep(0.02)  # the bytes wait in the kernel
         chunk = await port.receive(1.0)
         assert chunk is not None
         assert chunk.data == b"two"
 
 
-async def test_flushing_throws_old_bytes_away(pty: Pty) -> None:
+async def test_flushing_discards_old_bytes(pty: Pty) -> None:
     with SerialPort(pty.path, 115200) as port:
         os.write(pty.master, b"old")
         port.flush_input()
@@ -209,7 +209,7 @@ def test_a_forbidden_port_names_the_group_and_the_rule(monkeypatch: pytest.Monke
     [errno.EMFILE, errno.ENFILE, errno.EPROTO, errno.ETIMEDOUT, errno.ENOMEM, errno.ESHUTDOWN],
 )
 @pytest.mark.parametrize("kind", [OSError, termios.error, serial.SerialException])
-def test_an_error_of_system_or_hardware_may_pass(
+def test_an_error_of_system_or_hardware_may_be_temporary(
     number: int, kind: type[Exception], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: object, **__: object) -> None:

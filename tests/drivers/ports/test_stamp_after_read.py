@@ -1,7 +1,7 @@
-"""What comes while a process is held up before its read is not stamped as if it had come before.
+"""Data that arrive while the process is delayed before a read have no stamp before their arrival.
 
-Clocks rest on the earliest arrivals, so one stamp that is milliseconds early moves a clock for a
-minute; a late one moves nothing.
+Clock models use the earliest arrivals, so a stamp that is milliseconds early shifts a clock for a
+minute. A late stamp has no effect.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ def line() -> Iterator[tuple[int, str]]:
 
 
 def waiting(fd: int) -> int:
-    """Return how many bytes are there to be read."""
+    """Return the number of bytes that can be read."""
     count = array("i", [0])
     fcntl.ioctl(fd, termios.FIONREAD, count)
     return count[0]
 
 
-async def test_bytes_of_a_serial_line(
+async def test_serial_bytes_that_arrive_during_a_delay_are_stamped_after_their_arrival(
     line: tuple[int, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     far, path = line
@@ -78,7 +78,7 @@ async def test_bytes_of_a_serial_line(
 
 
 class SlowBus(can.BusABC):
-    """Hands out three frames, each of which comes after the one before was read."""
+    """A bus with three frames, each of which arrives after the previous frame was read."""
 
     def __init__(self, reader: int | None) -> None:
         super().__init__(channel="vcan")
@@ -107,7 +107,7 @@ class SlowBus(can.BusABC):
 
 
 @pytest.mark.parametrize("descriptor", [True, False], ids=["descriptor", "thread"])
-async def test_frames_of_a_can_bus(
+async def test_can_frames_that_arrive_during_a_delay_are_stamped_after_their_arrival(
     monkeypatch: pytest.MonkeyPatch,
     descriptor: bool,
 ) -> None:
@@ -131,11 +131,11 @@ async def test_frames_of_a_can_bus(
     os.close(near)
     os.close(far)
     for frame, came_ns, t_ns in zip(found, bus.came_ns, stamped, strict=True):
-        assert came_ns <= frame.t_ns <= t_ns  # of the frame, and of the chunk it is part of
+        assert came_ns <= frame.t_ns <= t_ns  # stamps of the frame and of its chunk
 
 
 class WithoutStamps:
-    """A socket whose kernel stamps nothing; its second datagram comes while the first is read."""
+    """A socket without kernel stamps; the second datagram arrives while the first is read."""
 
     def __init__(self, actual: Any) -> None:
         self._actual = actual
@@ -150,7 +150,7 @@ class WithoutStamps:
         return data, [], flags, address
 
 
-def test_datagrams_that_the_kernel_does_not_stamp() -> None:
+def test_datagrams_without_kernel_stamp_are_stamped_after_their_arrival() -> None:
     opened = UdpSocket("127.0.0.1", 0, sender="127.0.0.1")
     actual = opened._socket
     unstamped = WithoutStamps(actual)

@@ -1,4 +1,4 @@
-"""Feeds packets to a QTM decoder; small settings and short ways to write frames."""
+"""A QTM decoder for tests, small settings, and functions that return frames."""
 
 from __future__ import annotations
 

@@ -54,6 +54,16 @@ def sent(form: FrameFormat | LineFormat) -> bytes:
             FRAME._replace(message=(TableField(2, "u", 8), 4)),
             "frames have the type 4, expected 7: correct `frame.message.equals`",
         ),
+        (
+            FRAME._replace(length=14, end=b"\x0d", checksum=None),
+            FRAME._replace(length=14, end=b"\x0a", checksum=None),
+            "frames of 14 bytes do not end with 0D: correct `frame.end`",
+        ),
+        (
+            BY_LENGTH._replace(fields=FIELDS | {4: TableField(16, "i", 16)}),
+            BY_LENGTH,
+            "sync bytes AA 55 follow each other after 13 bytes, but the frames do not fit",
+        ),
         (FRAME, LINE, "they are text"),
         (LINE, FRAME, "they are not text"),
         (LINE._replace(prefix=b"$"), LINE, "no line begins with '$'"),
@@ -65,6 +75,12 @@ def sent(form: FrameFormat | LineFormat) -> bytes:
 )
 def test_the_report_names_the_key_that_fits(table: Any, device: Any, expected: str) -> None:
     assert expected in explain_bytes(sent(device), table)
+
+
+def test_sync_bytes_without_a_regular_distance_are_named() -> None:
+    plain = FRAME._replace(checksum=None)
+    data = b"".join(b"\xaa\x55" + bytes(number % 7) for number in range(40))
+    assert "sync bytes AA 55 have no regular distance" in explain_bytes(data, plain)
 
 
 @pytest.mark.parametrize("form", [FRAME, BY_LENGTH, LINE], ids=["fixed", "length", "lines"])

@@ -55,7 +55,7 @@ class MemoryPort:
 
 
 def messages_of(settings: SerialTableSettings, count: int = 400) -> list[bytes]:
-    """Return what a device that moves sends at 100 Hz."""
+    """Return the messages of a moving device at 100 Hz."""
     port = MemoryPort(settings)
     device = TableDevice(port, device_options(settings))
     for number in range(count):

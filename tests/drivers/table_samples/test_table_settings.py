@@ -213,6 +213,21 @@ def test_a_dbc_file_that_overlaps_or_is_missing_is_named(tmp_path: Path) -> None
     assert any("overlapping in message QUAT" in text for text in faults(table))
 
 
+def test_a_signed_signal_of_one_bit_is_named(tmp_path: Path) -> None:
+    pytest.importorskip("cantools")
+    fields = {
+        "quaternion": {"signals": ["QUAT.Q0", "Q1", "Q2", "Q3"]},
+        "valid": {"signals": ["OK"], "frame": "state"},
+    }
+    table = on_can(fields, dbc=str(tmp_path / "s.dbc"), ids={"state": 300, "quaternion": 305})
+    state = 'BO_ 300 STATE: 1 H\n SG_ OK : 0|1@1{} (1,0) [0|0] "" H\n'
+    (tmp_path / "s.dbc").write_text(DBC + state.format("+"))
+    assert faults(table) == []
+    (tmp_path / "s.dbc").write_text(DBC + state.format("-"))
+    (fault,) = faults(table)
+    assert "STATE.OK is signed and has 1 bit, so it can only be 0 or -1: declare it" in fault
+
+
 def test_a_missing_package_is_named_before_the_bus_is_opened(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -323,7 +338,7 @@ PAGES += "".join(
     )
     for signal in signals.split()
 )
-"""Frames with one identifier and, in PAGE, what they contain; Q0 and Q1 are on pages of a page."""
+"""Frames with one identifier. PAGE selects their content; Q0 and Q1 are on pages of a page."""
 RAW_SIGNALS = {
     "rate": {"signals": ["WX", "WY", "WZ"]},
     "acceleration": {"signals": ["AX", "AY", "AZ"]},

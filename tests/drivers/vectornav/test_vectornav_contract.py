@@ -67,7 +67,7 @@ class TestVectorNavWithRawMeasurements(TestVectorNav):
 
     @override
     def matches(self, number: int, measurement: Any) -> bool:
-        """By the specific force: the orientation depends on all readings before."""
+        """Compare the specific force, because the orientation depends on all earlier readings."""
         signals = InertialSignals()
         signals.update(0, orientation(number))
         return bool(measurement.acceleration == pytest.approx(signals.force, abs=0.01))

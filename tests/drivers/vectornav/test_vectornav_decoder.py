@@ -104,7 +104,7 @@ def test_raw_measurements_are_in_si_units() -> None:
 
 
 def test_the_probe_tells_the_two_families_with_the_byte_fa_apart() -> None:
-    """Recognition as by `jointfit probe`: samples for the own decoder, nothing for the other."""
+    """As in `jointfit probe`, only the decoder of the right family returns samples."""
     item = mtdata2.Item
     q = (0.5, -0.5, 0.1, 0.7)
     xsens = [

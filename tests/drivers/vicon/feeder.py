@@ -1,4 +1,4 @@
-"""Feeds packets to a Vicon decoder; two props and short ways to write frames."""
+"""A Vicon decoder for tests, two rigid objects, and functions that return their frames."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ class TestWitMotionRaw(TestWitMotion):
 
     @override
     def matches(self, number: int, measurement: Any) -> bool:
-        """By the acceleration: the orientation depends on all readings before."""
+        """Compare the acceleration, because the orientation depends on all earlier readings."""
         inertial = InertialSignals()
         inertial.update(0, orientation(number))
         force = inertial.value(Item.ACCELERATION)

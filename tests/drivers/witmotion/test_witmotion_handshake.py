@@ -1,4 +1,4 @@
-"""The WitMotion driver with devices of every setting, and what it writes into them."""
+"""The WitMotion driver with devices of every setting, and the settings that it writes."""
 
 from __future__ import annotations
 

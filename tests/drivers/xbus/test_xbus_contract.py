@@ -69,7 +69,7 @@ RAW_OUTPUTS = (
 
 
 @pytest.mark.skipif(find_spec("vqf") is None, reason="the extra vqf is not installed")
-class TestXbusThatOnlyFeels(TestXbus):
+class TestXbusWithRawMeasurements(TestXbus):
     """Raw readings on the wire, orientation on the gateway."""
 
     has_history = True
@@ -85,7 +85,7 @@ class TestXbusThatOnlyFeels(TestXbus):
 
     @override
     def matches(self, number: int, measurement: Any) -> bool:
-        """By what it felt: the orientation remembers all that came before."""
+        """Compare the acceleration, because the orientation depends on all earlier readings."""
         felt = InertialSignals()
         felt.update(0, orientation(number))
         force = felt.value(Item.ACCELERATION)

@@ -185,7 +185,7 @@ def test_time_that_leaps_without_the_counter_is_a_restart() -> None:
     assert [kind for kind, _ in told(events)] == ["restart"]
 
 
-def test_waking_up_is_a_restart_once_it_has_measured() -> None:
+def test_a_wake_up_is_a_restart_only_after_measurements() -> None:
     wake = encode(XbusMessageId.WAKE_UP)
     assert told(fed(decoder(), wake, message(1, 100))) == []
     events = fed(decoder(), message(900, 90_000), wake, message(0, 100), message(1, 200))
@@ -193,7 +193,7 @@ def test_waking_up_is_a_restart_once_it_has_measured() -> None:
 
 
 @given(st.integers(0, 65535), st.integers(0, 2**31), st.lists(st.integers(0, 400), max_size=60))
-def test_whatever_is_lost_is_counted_exactly(counter: int, ticks: int, losses: list[int]) -> None:
+def test_any_losses_are_counted_exactly(counter: int, ticks: int, losses: list[int]) -> None:
     follow = XbusContinuity(100.0)
     assert follow.orientation(counter, ticks, 0) == XbusStep()
     for lost in losses:
@@ -306,6 +306,9 @@ def test_a_quaternion_that_is_no_number_is_refused(bad: float) -> None:
 def test_wrong_scale_is_reported_once_with_the_measured_norm() -> None:
     events = fed(decoder(), *(message(n, 100 * n, (0.25, 0.0, 0.0, 0.0)) for n in range(300)))
     assert told(events) == [("warning", {"median_norm": 0.25})]
+    nothing = (math.nan, 0.0, 0.0, 0.0)
+    events = fed(decoder(), *(message(n, 100 * n, nothing) for n in range(300)))
+    assert told(events) == [("warning", {})]
 
 
 def test_items_that_do_not_fill_the_message_make_it_corrupt() -> None:

@@ -144,7 +144,7 @@ async def test_raw_outputs_are_written_once_where_the_gateway_computes_the_orien
     assert Item.QUATERNION not in dict(device.outputs)
 
 
-def test_increments_will_do_where_the_device_sends_them_already() -> None:
+def test_increments_are_accepted_if_the_device_sends_them() -> None:
     sent = ((0x1020, 0xFFFF), (0x1060, 0xFFFF), (0x8032, 100), (0x4012, 100))
     found = tuple(setup.Output(*output) for output in sent)
     needs = required_outputs("gateway", magnetometer=False)
@@ -284,7 +284,7 @@ async def test_noise_before_silence_is_reported_without_figures(tmp_path: Path) 
     line.unplug()
 
 
-async def test_a_silent_port_may_come_to_life(tmp_path: Path) -> None:
+async def test_a_silent_port_may_work_later(tmp_path: Path) -> None:
     line = PtyLine(tmp_path / "imu")
     driver = make(tmp_path)
     assert "silent" in await refusal(driver, DeviceLostError)
@@ -360,7 +360,7 @@ def test_a_rate_that_is_no_whole_number_up_to_400_is_refused(
 
 
 @pytest.mark.parametrize("precision", Precision)
-def test_any_precision_world_and_company_will_do(precision: Precision) -> None:
+def test_any_precision_world_and_additional_output_is_accepted(precision: Precision) -> None:
     outputs = (
         setup.Output(Item.PACKET_COUNTER, 0xFFFF),
         setup.Output(Item.SAMPLE_TIME_FINE, 0xFFFF),

@@ -105,7 +105,7 @@ def test_the_interval_is_that_of_the_device_clock_and_not_the_nominal_one() -> N
     assert turned > 1.005 * 10.0
 
 
-def testicks_too_coarse_for_one_interval_do_not_change_the_turn() -> None:
+def test_ticks_too_coarse_for_one_interval_do_not_change_the_rotation() -> None:
     """At 60 Hz, an interval has 166.67 ticks; the first interval alone has an error of 0.4 %."""
     orientation = GatewayOrientation(60.0, magnetometer=False, settle_s=0.0)
     turned, before = 0.0, None
@@ -215,7 +215,7 @@ def test_heading_after_a_start_in_fast_motion_is_settled_with_the_inclination(
         }
         off = rotation.angle_between(np.array([*found.values()]), optical[list(found)])
         errors.append(np.degrees(np.sqrt(np.mean(off**2))))
-    assert max(errors) < 6.0  # 7.1 with the field from the start on
+    assert max(errors) < 6.0  # 7.1 if the field is used from the start on
 
 
 def delayed_fields(delay_s: float, amplitude: float) -> tuple[np.ndarray, ...]:
@@ -330,7 +330,7 @@ def test_heading_without_magnetometer_is_reported_at_the_start() -> None:
 
 @given(st.lists(st.floats(width=32), min_size=6, max_size=6))
 @settings(max_examples=60, deadline=None)
-def test_no_reading_whatever_poisons_the_filter(values: list[float]) -> None:
+def test_after_any_readings_the_orientations_remain_finite(values: list[float]) -> None:
     bad = ((Item.RATE_OF_TURN, tuple(values[:3])), (Item.ACCELERATION, tuple(values[3:])))
     sound = turning(6)
     contents = [*sound[:3], bad, *sound[3:]]
@@ -395,7 +395,7 @@ def test_only_the_filter_module_imports_the_package() -> None:
     st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(c * c for c in q) > 0.1),
     st.tuples(*[st.floats(-0.5, 0.5)] * 3),
 )
-def test_a_simulated_sensor_feels_the_turn_it_made(
+def test_a_simulated_sensor_measures_its_rotation(
     start: tuple[float, float, float, float], turn: tuple[float, float, float]
 ) -> None:
     before = rotation.normalize(np.array(start))
@@ -410,7 +410,7 @@ def test_a_simulated_sensor_feels_the_turn_it_made(
     assert rotation.rotate(after, np.array(force)) == pytest.approx(np.array(UP), abs=1e-9)
 
 
-def test_simulated_readings_filtered_give_the_simulated_movement_back() -> None:
+def test_filtered_simulated_readings_reproduce_the_movement() -> None:
     felt, wires, truth = InertialSignals(), [], []
     for k in range(1500):
         q = rotation.exp(np.array([0.6 * sin(0.02 * k), 0.3 * sin(0.013 * k), 0.4 * sin(0.01 * k)]))

@@ -26,7 +26,7 @@ class Player(XbusDevice):
         last = None
         for message in messages:
             items = dict(split(message.data) or [])
-            if Item.QUATERNION in items:  # the others carry foreign time
+            if Item.QUATERNION in items:  # the others have the time of another clock
                 ticks = decode_item(Item.SAMPLE_TIME_FINE, items[Item.SAMPLE_TIME_FINE])
                 assert isinstance(ticks, int)
                 if last is not None:

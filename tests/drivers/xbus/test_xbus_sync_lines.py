@@ -1,4 +1,4 @@
-"""Sync lines of Xbus devices: asked of them in rig.toml, told in messages, decoded as pulses."""
+"""Sync lines of Xbus devices: configuration by rig.toml, and edges decoded as pulses."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ async def serving(folder: Path, **options: Any) -> AsyncIterator[XbusDevice]:
 
 
 async def told(driver: XbusImu, device: XbusDevice, samples: int = 30) -> list[Any]:
-    """Run the driver; edges come every 30 ms; return what its decoder yields."""
+    """Run the driver with an edge every 30 ms; return the output of its decoder."""
     chunks: list[Chunk] = []
     task = asyncio.create_task(driver.run(chunks.append))
     async with asyncio.timeout(10):
@@ -167,7 +167,7 @@ entries = st.builds(
 
 
 @given(st.lists(entries, unique=True, max_size=10), st.randoms())
-def test_order_matters_to_no_device(stored: list[SyncSetting], dice: Any) -> None:
+def test_the_order_of_sync_settings_does_not_matter(stored: list[SyncSetting], dice: Any) -> None:
     shuffled = list(stored)
     dice.shuffle(shuffled)
     assert sync_differences(stored, shuffled) == []

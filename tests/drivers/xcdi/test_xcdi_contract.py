@@ -73,7 +73,7 @@ class TestXcdiWith29BitIdsInMicrosecondsOverAMuteAdapter(TestXcdiOverSlcan):
 
 
 class TestXcdiOnABusWithoutDescriptor(DriverContract):
-    """python-can's in-process bus: read by a pump thread, as most vendors' libraries are."""
+    """The in-process bus of python-can, which a thread reads, as with most vendors' libraries."""
 
     registered_as = "xcdi"
 
@@ -85,6 +85,6 @@ class TestXcdiOnABusWithoutDescriptor(DriverContract):
     def make_driver(self, folder: Path) -> Driver:
         return XcdiImu(settings("virtual", str(folder)))
 
-    # An in-process bus has no noise, and anything at all may share it.
+    # An in-process bus has no noise, and devices of any kind may use it.
     test_line_noise_affects_only_damaged_samples = None  # type: ignore[assignment]
     test_wrong_device_raises_device_misconfigured = None  # type: ignore[assignment]

@@ -164,6 +164,8 @@ def test_lost_groups_are_one_gap_and_no_restart() -> None:
         assert [gap.data["lost"] for gap in of_kind(found, "gap")] == [7]
         assert not of_kind(found, "restart")
         assert len(samples(found)) == 33
+        (gap,) = of_kind(found, "gap")
+        assert len(samples(found[: found.index(gap)])) == 20
 
 
 def test_a_lost_quaternion_is_a_gap_of_one() -> None:
@@ -241,7 +243,7 @@ def test_device_without_sample_time_is_decoded_and_reported_once() -> None:
 @pytest.mark.parametrize(
     "ahead", [(7, 300_000), (0, 0), (1, 0), (2, 40), (0, 103), (30_000, 2**31)]
 )
-def test_two_sensors_on_one_identifier_are_found_out_and_neither_is_used(
+def test_two_sensors_on_one_identifier_are_detected_and_neither_is_used(
     ahead: tuple[int, int], offset_ms: float
 ) -> None:
     first = FrameTape()
@@ -262,7 +264,7 @@ def test_two_sensors_on_one_identifier_are_found_out_and_neither_is_used(
     assert len(of_kind(found, "restart")) <= 3
 
 
-def test_two_sensors_that_speak_in_turn_frame_by_frame_are_found_out() -> None:
+def test_two_sensors_that_alternate_frame_by_frame_are_detected() -> None:
     tape = FrameTape()
     a, b = XcdiDevice(tape), XcdiDevice(tape, XcdiDeviceOptions(first_counter=500))
     for number in range(200):
@@ -283,7 +285,7 @@ def interleaved(groups: list[list[CanFrame]], order: random.Random) -> list[CanF
     return mixed
 
 
-def test_interleaved_groups_of_two_sensors_on_one_identifier_are_found_out() -> None:
+def test_interleaved_groups_of_two_sensors_on_one_identifier_are_detected() -> None:
     order, tape = random.Random(2), FrameTape()
     a, b = XcdiDevice(tape), XcdiDevice(tape, XcdiDeviceOptions(first_counter=500))
     frames: list[CanFrame] = []

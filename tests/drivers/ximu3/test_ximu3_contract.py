@@ -84,7 +84,7 @@ class TestXImu3WithOrientationOnTheGateway(TestXImu3):
 
     @override
     def matches(self, number: int, measurement: Any) -> bool:
-        """By the acceleration: the orientation depends on all samples before."""
+        """Compare the acceleration, because the orientation depends on all earlier samples."""
         x, y, z = vertical(number)
         force = tuple(GRAVITY * part for part in (x, y, z))
         return bool(measurement.acceleration == pytest.approx(force, abs=0.01))

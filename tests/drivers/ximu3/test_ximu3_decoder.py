@@ -268,6 +268,9 @@ def test_quaternions_of_another_scale_are_named() -> None:
     assert reports(events, "warning") == [
         "median quaternion norm is 3, expected 1: order or scale is wrong"
     ]
+    events = fed(decoder(), *(message(n, (math.nan,) * 4) for n in range(120)))
+    (warning,) = (e for e in events if isinstance(e, DeviceEvent) and e.kind == "warning")
+    assert warning.data == {}
 
 
 def test_edges_are_pulses_of_the_configured_wire() -> None:
