@@ -145,8 +145,9 @@ def _combine(
     radii = np.concatenate([e.radii for e in estimates])
     off = [f"marker_off:{k}" for k, weight in zip(names, w, strict=True) if weight < 0.5]
     bounds = np.array([e.bound for e in estimates])
-    ratio = np.array([e.bound / max(e.sd, 1e-12) if np.isfinite(e.sd) else 1.0 for e in estimates])
-    sd = float(np.sqrt(np.trace(C)))
+    errors = [max(e.rms_error, 1e-12) for e in estimates]
+    ratio = [b / x if np.isfinite(x) else 1.0 for b, x in zip(bounds, errors, strict=True)]
+    rms_error = float(np.sqrt(np.trace(C)))
 
     return CenterEstimate(
         method="several",
@@ -156,9 +157,9 @@ def _combine(
         residual=float(np.sqrt(np.mean([e.residual**2 for e in estimates]))),
         radii=radii,
         arc=max(e.arc for e in estimates),
-        bound=sd * float(np.mean(ratio))
+        bound=rms_error * float(np.mean(ratio))
         if len(unseen) == 0 and np.isfinite(bounds).all()
-        else (np.inf if len(unseen) else sd),
+        else (np.inf if len(unseen) else rms_error),
         conditioning=float(np.nanmedian(radii)) / float(np.sqrt(np.linalg.norm(spread, 2))),
         frames=max(e.frames for e in estimates),
         effective_frames=max(e.effective_frames for e in estimates),

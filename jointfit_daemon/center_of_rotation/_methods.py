@@ -71,7 +71,8 @@ def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterE
     method : str
         A key of `METHODS`, or ``auto``. ``auto`` selects ``score`` if `points` is None. Otherwise
         it selects ``geometric`` for points in a plane. For points in space it selects ``score`` if
-        the markers of both bodies are known (`Movement.both_markers`), and ``sphere`` if not.
+        the poses and the markers (`Movement.both_markers`) of both bodies are known, and ``sphere``
+        if not.
 
     Returns
     -------
@@ -118,7 +119,8 @@ def _automatic(movement: Movement) -> str:
         return "score"
     if movement.points.shape[-1] == 2:
         return "geometric"
-    return "sphere" if movement.both_markers() is None else "score"
+    posed = movement.parent is not None and movement.child is not None
+    return "score" if posed and movement.both_markers() is not None else "sphere"
 
 
 def _beyond_parent(found: CenterEstimate, parent: Array | None) -> CenterEstimate:

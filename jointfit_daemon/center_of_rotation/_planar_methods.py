@@ -46,7 +46,7 @@ OFF_AXIS = (
     "the marker paths are not planar, so the joint rotated about more than one axis: use sphere "
     "or score, or give the axis"
 )
-LIMITS = CircleLimits(sd=inf)
+LIMITS = CircleLimits(rms_error=inf)
 """Acceptance limits without a limit on the error. The user selected the method, so a center with a
 large error is returned, with its uncertainty.
 """

@@ -74,7 +74,7 @@ class CenterEstimate:
     """Cause and remedy if the center must not be used; None if the center is usable."""
 
     @property
-    def sd(self) -> float:
+    def rms_error(self) -> float:
         """Return the predicted RMS error √tr(covariance), m; inf if a direction is unobserved."""
         if len(self.unseen) > 0:
             return inf

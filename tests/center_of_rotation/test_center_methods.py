@@ -76,7 +76,7 @@ def test_bound_belongs_to_the_movement_not_to_the_method(name: str) -> None:
 def test_planar_methods_of_a_hinge_in_space_report_the_unseen_axis(name: str) -> None:
     found = estimate_center(whole("hinge"), name)
     assert found.refused is None
-    assert found.sd == inf
+    assert found.rms_error == inf
     assert found.axis is not None
     assert abs(found.axis[0]) > 0.999
     off = found.center - found.axis * (found.axis @ found.center)
@@ -102,7 +102,7 @@ def test_every_spatial_method_finds_a_ball_joint(name: str) -> None:
 def test_spatial_methods_detect_a_hinge(name: str) -> None:
     found = estimate_center(whole("hinge"), name)
     assert found.refused is None
-    assert found.sd == inf == found.bound
+    assert found.rms_error == inf == found.bound
     assert found.axis is not None
     assert abs(found.axis[0]) > 0.999
     assert np.linalg.norm(found.center) < 6e-3
@@ -123,6 +123,8 @@ def test_auto_selects_a_method_for_the_given_data() -> None:
     assert estimate_center(replace(both, child_markers=CHILD[:2])).method == "sphere"
     line = np.linspace(0.0, 0.1, 4)[:, None] * np.ones(3)
     assert estimate_center(replace(both, child_markers=line)).method == "sphere"
+    markers_only = replace(both, child_markers=CHILD, parent=None, child=None)
+    assert estimate_center(markers_only).method == "sphere"
     assert estimate_center(Movement(parent=ball.parent, child=ball.child)).method == "score"
     assert estimate_center(planar()).method == "geometric"
     assert estimate_center(planar().points[:, 0]).method == "geometric"  # type: ignore[index]  # it has points
@@ -157,7 +159,7 @@ def test_points_without_a_center_are_refused_by_every_method(name: str, kind: st
     found = estimate_center(Movement(points, angles=angles), name)
     assert found.refused is not None
     assert len(found.refused) > 25
-    assert found.sd == inf
+    assert found.rms_error == inf
 
 
 @pytest.mark.parametrize("name", ["sphere", "running_sphere", "geometric", "score", "sara"])
@@ -187,7 +189,7 @@ def test_no_method_returns_nan_without_a_refusal(seed: int, hidden: float, name:
     if found.refused is None:
         assert np.isfinite(found.center).all()
         assert np.isfinite(found.covariance).all()
-        assert not np.isnan([found.sd, found.noise, found.bound, found.arc]).any()
+        assert not np.isnan([found.rms_error, found.noise, found.bound, found.arc]).any()
 
 
 @pytest.mark.parametrize("arc", [20.0, 45.0, 90.0])
@@ -212,8 +214,8 @@ def test_three_frames_predict_their_error_from_the_residuals_of_the_cameras() ->
         points = circle + sd[:, None, None] * rng.normal(size=circle.shape)
         found = estimate_center(Movement(points, residuals=0.3 * sd[:, None]), "three_frames")
         errors.append(found.center)
-        stated.append(found.sd**2)
-        unstated.append(estimate_center(Movement(points), "three_frames").sd ** 2)
+        stated.append(found.rms_error**2)
+        unstated.append(estimate_center(Movement(points), "three_frames").rms_error ** 2)
     actual = np.mean(np.sum(np.square(errors), axis=1))
     assert np.sqrt(np.mean(stated) / actual) == pytest.approx(1.0, abs=0.1)
     assert np.sqrt(np.mean(unstated) / actual) > 1.5

@@ -49,7 +49,7 @@ class CircleLimits:
     """Smallest and largest accepted distance of a marker from the center, m."""
     arc: float = radians(10.0)
     """Smallest arc of the movement, rad."""
-    sd: float = inf
+    rms_error: float = inf
     """Largest accepted predicted RMS error, m. If noise increases the curvature of the arc by
     chance, the center is biased and the predicted error is too small. A limit near the expected
     error therefore selects biased centers, which are often outside their error ellipses.
@@ -180,10 +180,10 @@ def objection(radius: float, arc: float, T: float, sd: float, limits: CircleLimi
             f"{limits.gate:g} are required: increase the range of motion"
         )
 
-    if sd > limits.sd:
+    if sd > limits.rms_error:
         return (
             f"the predicted error is {1000 * sd:.0f} mm, above the limit of "
-            f"{1000 * limits.sd:.0f} mm: "
+            f"{1000 * limits.rms_error:.0f} mm: "
             "move the joint further or for longer"
         )
 

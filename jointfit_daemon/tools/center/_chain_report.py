@@ -37,7 +37,7 @@ def text(trial: MarkerTrial, joints: Sequence[ChainJoint]) -> str:
                 joint.name,
                 ",".join(side.parent),
                 _report.point(e.center),
-                _report.mm(_report.sd_seen(side.answer)),
+                _report.mm(_report.error_seen(side.answer)),
                 f"{degrees(e.arc):.0f}°",
                 _report.mm(e.residual),
                 _report.number(e.conditioning),

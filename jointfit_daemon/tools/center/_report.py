@@ -76,13 +76,13 @@ def details(answer: WindowEstimate) -> str:
 
     if not len(e.unseen):
         error = (
-            f"{mm(e.sd)} mm RMS predicted; lower bound for any method, with independent"
+            f"{mm(e.rms_error)} mm RMS predicted; lower bound for any method, with independent"
             f" noise: {mm(e.bound)} mm"
         )
     else:
         error = "unknown along the unobservable directions"
         if len(e.unseen) < len(e.center):
-            error += f"; {mm(sd_seen(answer))} mm RMS predicted in the other directions"
+            error += f"; {mm(error_seen(answer))} mm RMS predicted in the other directions"
 
     lines += [
         f"center    in the parent  {point(e.center)} mm",
@@ -104,7 +104,7 @@ def details(answer: WindowEstimate) -> str:
     return "\n".join(lines)
 
 
-def sd_seen(answer: WindowEstimate) -> float:
+def error_seen(answer: WindowEstimate) -> float:
     """Return the predicted RMS error in the observable directions, m; infinite without any."""
     e = answer.estimate
     if len(e.unseen) >= len(e.center):
@@ -121,7 +121,7 @@ def windows(found: Sequence[WindowEstimate]) -> str:
             (
                 f"{answer.start_s:.2f}–{answer.end_s:.2f}",
                 point(e.center),
-                mm(e.sd),
+                mm(e.rms_error),
                 mm(e.bound),
                 _semi_axes(answer),
                 f"{degrees(e.arc):.0f}°",
@@ -192,8 +192,8 @@ def answer_json(answer: WindowEstimate) -> dict[str, Any]:
         "center_parent_m": e.center.tolist(),
         "center_world_m": answer.world.tolist(),
         "covariance_m2": e.covariance.tolist(),
-        "sd_m": e.sd,
-        "sd_seen_m": sd_seen(answer),
+        "error_m": e.rms_error,
+        "error_seen_m": error_seen(answer),
         "bound_m": e.bound,
         "semi_axes_95_m": answer.semi_axes.tolist(),
         "unseen": e.unseen.tolist(),

@@ -117,7 +117,7 @@ def test_windowed_running_circle_equals_fit_of_last_frames(window: int) -> None:
     batch = circle_estimate(p[-window - 1 :])
     assert batch.frames == live.frames == window
     assert np.abs(live.center - batch.center).max() < 1e-9
-    assert live.sd == pytest.approx(batch.sd, abs=1e-9)
+    assert live.rms_error == pytest.approx(batch.rms_error, abs=1e-9)
 
 
 def test_many_circles_at_once_are_the_same_circles() -> None:
@@ -147,7 +147,7 @@ def test_robust_running_circle_reduces_weight_of_a_jump() -> None:
     truth = np.array([0.2, -0.4])
     assert np.linalg.norm(robust.center - truth) < 0.006
     assert np.linalg.norm(plain.center - truth) > 3 * np.linalg.norm(robust.center - truth)
-    assert plain.sd > 3 * robust.sd
+    assert plain.rms_error > 3 * robust.rms_error
 
 
 @given(st.lists(st.tuples(anything, anything), max_size=40), st.sampled_from(METHODS))
@@ -161,7 +161,7 @@ def test_circle_estimate_of_any_points_is_finite_or_refused(points: Any, method:
         ):
             assert np.isfinite(found.center).all()
             assert np.isfinite(found.covariance).all()
-            assert found.refused is not None or isfinite(found.sd)
+            assert found.refused is not None or isfinite(found.rms_error)
             if found.refused is not None:
                 assert ":" in found.refused
 
@@ -187,7 +187,7 @@ def test_a_refusal_names_cause_and_remedy(points: Any, cause: Any) -> None:
 
 def test_refused_circle_has_infinite_error() -> None:
     found = fed(np.ones((50, 2))).estimate()
-    assert found.sd == found.bound == inf
+    assert found.rms_error == found.bound == inf
     assert fed(np.ones((50, 2))).circle() is None
     with pytest.raises(ValueError, match="line"):
         fit_circle(np.ones((5, 2)))
@@ -243,7 +243,7 @@ def test_correlated_residuals_increase_the_covariance() -> None:
     for estimate in (circle_estimate, geometric_estimate):
         found, plain = estimate(p), estimate(shuffled)
         assert found.effective_frames < 100
-        assert found.sd > 2.0 * plain.sd
+        assert found.rms_error > 2.0 * plain.rms_error
     assert persistence(np.array([nan, -1.0, 0.5])) == pytest.approx([1.0, 1.0, 3.0])
 
 
@@ -307,7 +307,7 @@ def test_predicted_error_equals_actual_error_at_20_degrees() -> None:
 
 def test_circle_limits_of_the_caller_apply() -> None:
     p = swing(arc=24.0)
-    strict, lax = CircleLimits(sd=0.001), CircleLimits(sd=1.0)
+    strict, lax = CircleLimits(rms_error=0.001), CircleLimits(rms_error=1.0)
     refused = circle_estimate(p, limits=strict).refused
     assert refused is not None
     assert "predicted error" in refused

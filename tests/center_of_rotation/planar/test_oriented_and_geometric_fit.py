@@ -81,7 +81,7 @@ def test_angle_noise_of_the_caller_sets_the_uncertainty() -> None:
     t = t + 0.05 * np.random.default_rng(0).normal(size=100)
     sure = oriented_estimate(p, t, 0.02, noise=AngleNoise(0.001, 1.0, 0.06, 0.001), limits=WIDE)
     unsure = oriented_estimate(p, t, 0.02, noise=AngleNoise(0.2, 1.0, 0.2, 0.5), limits=WIDE)
-    assert sure.sd < unsure.sd
+    assert sure.rms_error < unsure.rms_error
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_degenerate_paths_give_no_warning_and_a_finite_estimate(points: Any) -> 
     found = oriented_estimate(points, np.linspace(0.0, 1.0, len(points)), 0.01)
     assert np.isfinite(found.center).all()
     assert np.isfinite(found.covariance).all()
-    assert found.refused is not None or np.isfinite(found.sd)
+    assert found.refused is not None or np.isfinite(found.rms_error)
 
 
 @given(
@@ -161,7 +161,7 @@ def test_geometric_fit_equals_hyper_on_clean_points_and_resists_outliers() -> No
     plain = circle_estimate(p)
     found = geometric_estimate(p, robust=False)
     assert found.center == pytest.approx(plain.center, abs=2e-4)
-    assert found.sd == pytest.approx(plain.sd, rel=0.1)
+    assert found.rms_error == pytest.approx(plain.rms_error, rel=0.1)
     p[::10] += (0.04, 0.02)
     assert np.linalg.norm(geometric_estimate(p).center) < 0.006
     assert np.linalg.norm(circle_estimate(p).center) > 0.01
@@ -173,4 +173,4 @@ def test_markers_round_the_joint_share_their_center() -> None:
     joined, C = combine([circle_estimate(p, limits=WIDE) for p in each])
     assert np.linalg.norm(together.center) < 0.01
     assert np.linalg.norm(joined) < 0.012
-    assert np.sqrt(np.trace(C)) == pytest.approx(together.sd, rel=0.3)
+    assert np.sqrt(np.trace(C)) == pytest.approx(together.rms_error, rel=0.3)

@@ -59,7 +59,7 @@ def test_three_frame_estimate_of_any_points_is_finite_or_refused(values: Any) ->
         found = three_frame_estimate(np.reshape(values, (3, 2)), 0.001)
     assert np.isfinite(found.center).all()
     assert np.isfinite(found.covariance).all()
-    assert not np.isnan([found.sd, found.arc, found.bound, found.conditioning]).any()
+    assert not np.isnan([found.rms_error, found.arc, found.bound, found.conditioning]).any()
     assert np.isfinite(found.radii).all()
     if found.refused is not None:
         assert ":" in found.refused  # cause: remedy
@@ -69,7 +69,7 @@ def test_the_covariance_is_the_bound_of_three_points() -> None:
     t = np.array([0.2, 0.9, 1.7])
     found = three_frame_estimate(on_circle(t, center=(3.0, -2.0)), 0.001)
     assert found.covariance == pytest.approx(circle_bound(t, 0.001)[:2, :2], rel=1e-9)
-    assert found.sd == pytest.approx(found.bound)
+    assert found.rms_error == pytest.approx(found.bound)
 
 
 @pytest.mark.parametrize("points", [[[0, 0], [1, 1], [2, 2]], [[0, 0], [0, 0], [1, 0]]])
@@ -78,7 +78,7 @@ def test_points_on_a_line_are_infinitely_far_and_refused(points: Any) -> None:
     found = three_frame_estimate(points, 0.001)
     assert found.refused is not None
     assert "line" in found.refused
-    assert found.sd == inf
+    assert found.rms_error == inf
 
 
 def test_three_frame_estimate_refuses_an_arc_hidden_by_noise() -> None:
@@ -127,7 +127,7 @@ def test_a_plane_is_across_its_axis_and_right_handed(axis: Any) -> None:
     assert plane_of((1, 0, 0)) == pytest.approx(np.eye(3)[:, 1:])
 
 
-def test_a_grid_finds_the_node_an_arc_is_round_about() -> None:
+def test_a_grid_search_finds_the_node_at_the_center() -> None:
     grid = Grid((0.0, 0.0), 0.05, 0.01)
     points = on_circle(np.linspace(0, 4, 30), 0.2, (0.02, -0.03))
     assert grid_center(points, grid) == pytest.approx([0.02, -0.03])

@@ -49,7 +49,7 @@ def test_streaming_equals_all_frames_at_once(forgetting: float, gaps: float) -> 
     assert np.abs(live.center - whole.center).max() < 1e-9
     assert np.abs(live.covariance - whole.covariance).max() < 1e-12
     assert live.noise == pytest.approx(whole.noise, abs=1e-9)
-    assert live.sd == pytest.approx(whole.sd, abs=1e-9)
+    assert live.rms_error == pytest.approx(whole.rms_error, abs=1e-9)
 
 
 @given(st.integers(0, 10_000), st.tuples(*[st.floats(-0.6, 0.6)] * 3))
@@ -77,7 +77,7 @@ def test_a_hinge_shows_its_axis_and_infinite_variance_along_it() -> None:
     assert found.refused is None
     assert found.axis is not None
     assert abs(found.axis[0]) > 0.9999
-    assert found.sd == inf == found.bound
+    assert found.rms_error == inf == found.bound
     assert "hinge" in found.flags
     assert np.linalg.norm(found.center - CENTER) < 2e-3
     assert np.allclose(found.covariance @ found.axis, 0.0, atol=1e-12)
@@ -90,8 +90,8 @@ def test_predicted_error_falls_and_exceeds_the_bound() -> None:
         stream.feed(frame)
         if number in {100, 400, 1600}:
             found = stream.estimate()
-            told.append(found.sd)
-            assert found.bound == pytest.approx(found.sd, rel=0.3)
+            told.append(found.rms_error)
+            assert found.bound == pytest.approx(found.rms_error, rel=0.3)
             assert found.frames == number
     assert told[0] / told[1] == pytest.approx(2.0, rel=0.3)
     assert told[1] / told[2] == pytest.approx(2.0, rel=0.3)
@@ -112,7 +112,7 @@ def test_a_marker_that_jumps_and_one_that_slips_move_the_center_little() -> None
     assert any(flag.endswith(":1") for flag in found.flags)
 
 
-def test_a_ghost_as_first_sample_is_forgotten() -> None:
+def test_a_ghost_marker_in_the_first_sample_has_no_lasting_effect() -> None:
     points = ball(np.random.default_rng(6), n=400)
     points[0] += 50.0
     stream = RunningSphere(4)
@@ -151,7 +151,7 @@ def test_running_sphere_refusal_names_cause_and_remedy(points: Array, words: str
     found = fed(points).estimate()
     assert found.refused is not None
     assert any(word in found.refused for word in words.split("|"))
-    assert found.sd == inf or found.sd > 0.005
+    assert found.rms_error == inf or found.rms_error > 0.005
 
 
 def some_points(kind: str, rng: np.random.Generator, noise: float) -> Array:
@@ -188,7 +188,7 @@ def test_nan_center_is_always_rejected(seed: int, kind: str, noise: float, hidde
             assert np.isfinite(found.center).all()
             assert np.isfinite(found.covariance).all()
             assert np.linalg.eigvalsh(found.covariance)[0] > -1e-12 * np.trace(found.covariance)
-            assert not np.isnan([found.sd, found.noise, found.bound, found.arc]).any()
+            assert not np.isnan([found.rms_error, found.noise, found.bound, found.arc]).any()
 
 
 def test_soft_tissue_artefact_does_not_make_a_hinge_a_ball_joint() -> None:

@@ -29,7 +29,7 @@ from jointfit_daemon.center_of_rotation.spatial import (
     spatial_noise,
 )
 
-ANYHOW = CircleLimits(gate=0.0, arc=0.0, sd=inf)
+ANYHOW = CircleLimits(gate=0.0, arc=0.0, rms_error=inf)
 
 
 def test_score_is_exact_without_noise_and_calibrated_with_noise() -> None:
@@ -45,7 +45,7 @@ def test_score_is_exact_without_noise_and_calibrated_with_noise() -> None:
     assert held >= 48
 
 
-def test_score_forgives_frames_with_swapped_markers() -> None:
+def test_score_tolerates_frames_with_swapped_markers() -> None:
     rng = np.random.default_rng(2)
     seen = watched(rng, ball_turns(rng, 60, 300))
     t = seen.child.t.copy()
@@ -61,7 +61,7 @@ def test_a_hinge_is_an_axis_for_both_methods() -> None:
         fit_axis(seen.parent, seen.child, near=np.zeros(3), toward=np.array([1.0, 0, 0])),
         fit_score(seen.parent, seen.child, near=np.zeros(3)),
     ):
-        assert found.sd == inf == found.bound
+        assert found.rms_error == inf == found.bound
         assert found.axis is not None
         assert abs(found.axis[0]) > 0.999
         assert np.linalg.norm(found.center) < 6e-3
@@ -92,13 +92,13 @@ def test_score_and_sara_refuse_hidden_and_resting_bodies() -> None:
             assert word in found.refused
 
 
-def test_markers_fused_fill_each_others_weak_direction() -> None:
+def test_fused_markers_determine_each_others_weak_direction() -> None:
     rng = np.random.default_rng(6)
     seen = fan(20.0) + rng.normal(0, 2e-3, (100, 4, 2))
     single = [circle_estimate(seen[:, j], limits=ANYHOW) for j in range(4)]
     fused = fuse_centers(single)
-    assert fused.sd < 0.2 * min(estimate.sd for estimate in single)
-    assert np.linalg.norm(fused.center) < 3.0 * fused.sd
+    assert fused.rms_error < 0.2 * min(estimate.rms_error for estimate in single)
+    assert np.linalg.norm(fused.center) < 3.0 * fused.rms_error
 
 
 def test_a_marker_that_contradicts_the_others_is_named_and_loses_its_weight() -> None:
@@ -128,18 +128,18 @@ def test_a_shared_unseen_direction_stays_unseen() -> None:
     # one axis for all, as a user gives it
     common = [replace(f, unseen=found[0].unseen, axis=found[0].axis) for f in found]
     fused = fuse_centers(common)
-    assert fused.sd == inf
+    assert fused.rms_error == inf
     assert fused.axis is not None
     assert abs(fused.axis[0]) > 0.999
 
 
-def test_parents_that_fix_no_frame_are_refused() -> None:
+def test_parents_that_define_no_frame_are_refused() -> None:
     line = np.linspace(0, 1, 4)[:, None] * np.ones(3)
     with pytest.raises(ValueError, match="not on a line"):
         spatial_noise(CHILD[0], line, 1e-3)
 
 
-def test_knowing_the_shape_of_the_parents_noise_takes_some_bias_out() -> None:
+def test_the_known_noise_of_the_parent_reduces_the_bias() -> None:
     rng = np.random.default_rng(11)
     aside = 0.3 * PARENT + np.array([0.25, 0.0, 0.0])
     plain, told = [], []

@@ -37,7 +37,7 @@ def test_a_child_at_rest_in_a_noisy_parent_is_refused(name: str, noise: float) -
         assert "move" in found.refused
 
 
-def test_turns_of_a_loose_parent_are_not_the_joints() -> None:
+def test_rotations_of_a_loose_parent_are_no_joint_rotations() -> None:
     believed = 0
     for seed in range(12):
         rng = np.random.default_rng(seed)
@@ -48,10 +48,10 @@ def test_turns_of_a_loose_parent_are_not_the_joints() -> None:
         known = Movement(seen.points, seen.parent, seen.child, loose)
         found = estimate_center(known, "sphere")
         assert found.refused is not None
-    assert believed >= 3, "the case has lost its point: points alone are refused anyway"
+    assert believed >= 3, "the test is useless: without the known frame, points are refused, too"
 
 
-def test_the_turn_of_a_parents_frame_agrees_with_simulation() -> None:
+def test_the_rotation_noise_of_a_parents_frame_agrees_with_simulation() -> None:
     rng = np.random.default_rng(1)
     seen = PARENT + rng.normal(0, 1e-3, (20_000, *PARENT.shape))
     q = rigid_fit(PARENT, seen)[0]
@@ -61,7 +61,7 @@ def test_the_turn_of_a_parents_frame_agrees_with_simulation() -> None:
 
 
 def on_skin(seed: int, cycles: int = 4) -> Array:
-    """Return a knee's markers, each sliding with the flexion its own way; center at the origin."""
+    """Return the markers of a knee with soft-tissue artefact, m; the center is the origin."""
     rng = np.random.default_rng(seed)
     s = np.linspace(0.0, 2.0 * np.pi * cycles, 100 * cycles)
     flexion = np.radians(35.0) * np.sin(s)
@@ -78,11 +78,13 @@ def test_direction_shown_only_by_soft_tissue_artefact_is_unseen() -> None:
     for seed in range(12):
         points = on_skin(seed)
         trusting = fit_sphere(points, limits=SphereLimits(posture=False))
-        misled += bool(trusting.sd < inf and np.linalg.norm(trusting.center) > 3.0 * trusting.sd)
+        misled += bool(
+            trusting.rms_error < inf and np.linalg.norm(trusting.center) > 3.0 * trusting.rms_error
+        )
         found = fit_sphere(points)
-        assert found.refused is not None or found.sd == inf
+        assert found.refused is not None or found.rms_error == inf
         assert "residuals_repeat" in found.flags
-    assert misled >= 6, "the case has lost its point: it misleads nobody"
+    assert misled >= 6, "the test is useless: without the check, the center is correct, too"
 
 
 def test_predicted_error_with_soft_tissue_artefact_matches_actual_error() -> None:

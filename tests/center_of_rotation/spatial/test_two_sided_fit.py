@@ -45,7 +45,7 @@ def test_noise_of_distant_clusters_does_not_bias_the_center() -> None:
 
 
 @pytest.mark.parametrize("rom", [20.0, 90.0])
-def test_the_ellipsoid_holds_in_small_and_large_movements(rom: float) -> None:
+def test_the_ellipsoid_covers_the_center_in_small_and_large_movements(rom: float) -> None:
     rng = np.random.default_rng(2)
     held = [
         covers(estimate_center(subject(k, 3 + k % 2).observe(rng, rom, 1e-3))) for k in range(40)
@@ -95,7 +95,7 @@ def test_center_agrees_with_an_adjustment_of_all_markers() -> None:
     poses = np.concatenate((rotation.log(parent.q), turned, parent.t), axis=1)
     exact = adjusted_center(person, above, below, np.concatenate((np.zeros(6), poses.ravel())))
     assert len(above) == n
-    assert np.linalg.norm(found.center - exact) < 0.05 * found.sd
+    assert np.linalg.norm(found.center - exact) < 0.05 * found.rms_error
 
 
 @given(
@@ -124,7 +124,7 @@ def test_another_origin_and_other_axes_of_the_parent_move_the_estimate_along(
     )
     here, there = estimate_center(seen), estimate_center(moved)
     assert there.center == pytest.approx(rotation.rotate(q, here.center) + d, abs=1e-6)
-    assert there.sd == pytest.approx(here.sd, rel=1e-4)
+    assert there.rms_error == pytest.approx(here.rms_error, rel=1e-4)
 
 
 def test_a_joint_at_rest_between_noisy_clusters_is_refused() -> None:
@@ -139,7 +139,7 @@ def test_the_artefact_that_repeats_with_posture_widens_the_error() -> None:
     rng = np.random.default_rng(7)
     found = estimate_center(subject(2).observe(rng, 60.0, 3e-4, 1e-3))
     assert "residuals_repeat" in found.flags
-    assert found.sd > 5.0 * found.bound
+    assert found.rms_error > 5.0 * found.bound
     assert covers(found)
 
 

@@ -23,10 +23,10 @@ def study() -> dict[str, PairMaps]:
     ("name", "clip", "predicted", "grid"),
     [("α–σ", 0.3, 0.98, 0.81), ("r–σ", None, 1.00, 0.99), ("r–α", 0.15, 0.96, 0.91)],
 )
-def test_the_tables_correlations_come_out(
+def test_the_correlations_of_the_table_are_reproduced(
     study: dict[str, PairMaps], name: str, clip: float | None, predicted: float, grid: float
 ) -> None:
-    """published-error-maps with fewer runs than the bench and the same tolerances."""
+    """The experiment published-error-maps with fewer runs and the same tolerances."""
     maps = study[name].maps
     analytic = maps["three frames"]
     assert correlation(maps["predicted"], analytic, clip) == pytest.approx(predicted, abs=0.03)
@@ -44,7 +44,7 @@ def test_maps_are_as_large_as_their_axes(study: dict[str, PairMaps]) -> None:
             assert values.shape == (len(pair.rows), len(pair.columns))
 
 
-def test_without_noise_every_method_but_a_shifted_grid_is_right(
+def test_without_noise_every_method_but_a_shifted_grid_is_exact(
     study: dict[str, PairMaps],
 ) -> None:
     for pair in (study["α–σ"], study["r–σ"]):
@@ -111,4 +111,4 @@ def test_many_runs_at_once_are_the_estimator_of_one_movement() -> None:
     together = oriented_centers(points, measured, 0.02)
     for i in range(12):
         alone = oriented_estimate(points[i], measured[i], 0.02)
-        np.testing.assert_allclose(together[i], alone.center, atol=0.05 * alone.sd)
+        np.testing.assert_allclose(together[i], alone.center, atol=0.05 * alone.rms_error)

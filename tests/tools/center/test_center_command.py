@@ -85,7 +85,7 @@ def answer(*arguments: object) -> dict[str, Any]:
 def test_a_ball_joints_center_is_found_in_the_parents_own_axes(trc: Path, method: str) -> None:
     found = answer(trc, *OPTIONS, "--method", method)
     np.testing.assert_allclose(found["center_parent_m"], expected_in_parent(), atol=0.002)
-    assert found["sd_m"] < 0.002
+    assert found["error_m"] < 0.002
     assert found["refused"] is None
 
 
@@ -159,7 +159,7 @@ def test_two_parent_markers_and_one_of_the_child_are_enough_in_a_plane(tmp_path:
     assert "--plane" in refused.stderr
 
 
-def test_a_window_is_a_line(trc: Path) -> None:
+def test_each_time_window_is_a_line_of_output(trc: Path) -> None:
     result = run(app, ["center", str(trc), *OPTIONS, "--window", "1"])
     assert result.exit_code == 0
     assert [line.split()[0] for line in result.stdout.splitlines()[-4:]] == [
@@ -234,8 +234,8 @@ def test_hinge_reports_the_error_normal_to_its_axis(tmp_path: Path) -> None:
     write_trc(tmp_path / "hinge.trc", hinge_trial())
     asked = [str(tmp_path / "hinge.trc"), *OPTIONS]
     found = answer(*asked)
-    assert found["sd_m"] is None
-    assert 0.0 < found["sd_seen_m"] < 0.003
+    assert found["error_m"] is None
+    assert 0.0 < found["error_seen_m"] < 0.003
     told = run(app, ["center", *asked]).stdout
     assert "error     unknown along the unobservable directions; " in told
     assert "in the other directions" in told
@@ -252,7 +252,7 @@ def test_a_plot_is_drawn(tmp_path: Path, kind: str) -> None:
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
     trc = tmp_path / "any.trc"
     write_trc(trc, ball_trial() if kind == "ball" else hinge_trial())
-    done = subprocess.run(  # a process of its own: matplotlib keeps its fonts open
+    done = subprocess.run(  # in a new process, because matplotlib keeps its fonts open
         [
             sys.executable,
             "-m",

@@ -266,7 +266,7 @@ def test_stick_figures_are_drawn_in_a_plane_and_in_space(tmp_path: Path) -> None
     script = "from jointfit_daemon.tools.__main__ import app\n" + "".join(
         f"app({call!r}, standalone_mode=False)\n" for call in calls
     )
-    done = subprocess.run(  # a process of its own: matplotlib keeps its fonts open
+    done = subprocess.run(  # in a new process, because matplotlib keeps its fonts open
         [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, check=False
     )
     assert done.returncode == 0, done.stderr
