@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 DEG = math.pi / 180.0
 LOCKED = np.array([[0.4, math.pi / 2, 0.9], [-0.4, -math.pi / 2, 0.2], [0.1, math.pi / 2, 3.0]])
-"""z, y, x: where the patent's outer angles turn about one line."""
+"""Rotations about z, y, x at which the outer angles of the patent have the same axis."""
 
 
 def random_rotations(count: int, seed: int = 0) -> NDArray[np.float64]:
@@ -85,7 +85,7 @@ def test_pure_flexion_is_the_same_by_every_definition() -> None:
 
 
 def mirrored(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rotation as a mirror in the sagittal plane shows it."""
+    """Return the rotation reflected about the sagittal plane."""
     return np.multiply(q, [1.0, 1.0, -1.0, -1.0])
 
 

@@ -1,4 +1,4 @@
-"""Rotations against SciPy, which shares no code with them, and against the laws of the group."""
+"""Rotations, compared with SciPy, which has independent code, and with group properties."""
 
 from __future__ import annotations
 
@@ -56,13 +56,15 @@ def test_a_vector_turns_as_scipy_turns_it(q: Quaternion, v: Vector) -> None:
 
 
 @given(quaternions, quaternions, vectors)
-def test_one_call_is_two_calls(p: Quaternion, q: Quaternion, r: Vector) -> None:
+def test_combined_functions_equal_two_calls(p: Quaternion, q: Quaternion, r: Vector) -> None:
     assert one.difference_one(p, q) == one.log_one(one.between_one(p, q))
     assert one.perturb_one(p, r) == one.multiply_one(p, one.exp_one(r))
 
 
 @given(quaternions, components)
-def test_a_bone_turns_as_any_vector_does(q: Quaternion, length: float) -> None:
+def test_rotation_of_a_vector_along_z_equals_the_general_rotation(
+    q: Quaternion, length: float
+) -> None:
     assert one.rotate_z_one(q, length) == one.rotate_one(q, (0.0, 0.0, length))
 
 
@@ -101,14 +103,14 @@ def test_matrices_round_trip_also_at_half_turns() -> None:
 
 
 @given(quaternions, quaternions, st.floats(0.0, 1.0))
-def test_interpolation_takes_the_short_way(p: Quaternion, q: Quaternion, a: float) -> None:
+def test_interpolation_uses_the_shortest_rotation(p: Quaternion, q: Quaternion, a: float) -> None:
     whole = float(rot.angle_between(p, q))
     point = rot.interpolate(p, q, a)
     assert float(rot.angle_between(p, point)) == pytest.approx(a * whole, abs=1e-9)
     assert np.allclose(one.interpolate_one(p, q, a), point, atol=1e-12)
 
 
-def test_the_mean_is_scipys_and_blind_to_signs() -> None:
+def test_the_mean_equals_scipys_for_any_signs() -> None:
     rng = np.random.default_rng(1)
     q = rot.multiply(rot.exp([0.3, -0.8, 2.0]), rot.exp(rng.normal(0, 0.3, (50, 3))))
     weights = rng.uniform(0.1, 2.0, 50)

@@ -1,8 +1,11 @@
 r"""Levenberg-Marquardt search over many instants, each of which has its own damping.
 
 Invariant: a step is accepted only at instants where the step lowers the cost. At other instants the
-damping is increased. Converged instants take no further steps. In addition to the marker errors the
-cost contains *bands*, which penalize joint rotations outside a range:
+damping is increased. Converged instants take no further steps. If no damped step lowers the cost,
+as at the jump of a band at half a turn, the search ends, but the instant has not converged.
+
+In addition to the marker errors the cost contains *bands*, which penalize joint rotations outside a
+range:
 
 .. math:: \sum_k w_k \left(v_k - clip(v_k, low_k, high_k)\right)^2, \qquad
           v = \log(A_{ref}^T A)
@@ -46,7 +49,9 @@ _EASIER = 0.2
 _HARDER = 8.0
 """Factor by which the damping is multiplied after a rejected step."""
 _HOPELESS = 1e6
-"""Damping above which the search at an instant ends."""
+"""Damping above which the search at an instant ends without convergence. At a minimum it is not
+reached, because the damping first reduces the steps below `_STILL`.
+"""
 _RIDGE = 1e-10
 """Absolute damping, for degrees of freedom without information."""
 _STILL = 1e-8
@@ -235,7 +240,7 @@ def _descend(problem: PoseProblem, start: ChainState) -> PoseSolution:
         ended = done | given_up
         if ended.any():
             found.put(here[ended], state.take(ended))
-            converged[here[ended]] = True
+            converged[here[ended]] = done[ended]
             going = np.flatnonzero(~ended)
             here, state, part = here[going], state.take(going), part.take(going)
             at, cost, damping = at.take(going), cost[going], damping[going]

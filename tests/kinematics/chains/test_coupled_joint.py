@@ -39,7 +39,7 @@ BENT = np.linspace(-0.3, 2.3, 40)
 
 
 def knee_pose(amounts: np.ndarray) -> tuple[Rotation, np.ndarray]:
-    """Return a knee that rolls back and screws home as it bends."""
+    """Return rotations and translations, m, of a knee that moves along and rotates with flexion."""
     a = np.asarray(amounts)
     turned = np.stack((-a, 0.2 * np.sin(a), 0.15 * (1.0 - np.cos(a))), axis=-1)
     shift = np.stack((0.002 * a, -0.02 * np.sin(a), 0.01 * a * a), axis=-1)
@@ -104,7 +104,7 @@ def test_the_twist_of_a_curve_is_its_derivative(amount: float) -> None:
 
 @given(st.floats(-3.0, 5.0))
 @settings(max_examples=60)
-def test_one_instant_is_as_it_is_among_others(amount: float) -> None:
+def test_one_instant_equals_the_same_instant_of_a_trial(amount: float) -> None:
     curve = CoupledCurve.through(samples())
     alone, among = curve.at(np.array([amount])), curve.at(np.array([0.1, amount]))
     np.testing.assert_allclose(alone[0][0], among[0][1], atol=1e-12)
@@ -153,7 +153,7 @@ def test_sums_over_segments_are_the_dense_normal_equations(seed: int) -> None:
     np.testing.assert_allclose(g, np.einsum("tmik,tm,tmi->tk", J, w, e), atol=1e-9)
 
 
-def test_true_markers_give_back_the_coordinate_from_nowhere() -> None:
+def test_true_markers_determine_the_coordinate_without_a_start() -> None:
     model = leg()
     truth = apply_step(model, rest_state(model, len(BENT)), squat(model))
     found = solve_frames(model, marker_positions(model, truth))
@@ -162,7 +162,7 @@ def test_true_markers_give_back_the_coordinate_from_nowhere() -> None:
     np.testing.assert_allclose(coupled_coordinates(model, found.state)["shank"], BENT, atol=1e-7)
 
 
-def test_a_coordinate_stays_within_its_limits_where_they_count() -> None:
+def test_a_coordinate_stays_within_limits_that_have_a_weight() -> None:
     model = leg()
     beyond = np.array([-0.3, 1.0, 2.3])
     y = marker_positions(model, apply_step(model, rest_state(model, 3), squat(model, beyond)))

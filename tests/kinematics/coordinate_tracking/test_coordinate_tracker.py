@@ -1,4 +1,4 @@
-"""Coordinates of one instant after the other equal those of the whole trial.
+"""Coordinates that are computed one instant after another equal the coordinates of a whole trial.
 
 Numerical steps are counted, because times depend on the machine.
 """
@@ -170,7 +170,7 @@ def test_oblique_axes_are_inverted_in_few_steps_an_instant() -> None:
     assert thigh.pose is not None
     tracker = CoordinateTracker(BALL, (default_coordinates(BALL)[0], thigh))
     for k in range(60):
-        # jumps now and then, to where no earlier value leads
+        # One jump, for which the earlier values are no good start.
         values = np.array([np.sin(0.1 * k) + 2.0 * (k > 30), 0.4 * np.cos(0.2 * k), 0.05 * k - 2.0])
         A = thigh.pose(values[None])[0][0]
         calls[0] = 0

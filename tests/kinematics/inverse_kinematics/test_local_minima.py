@@ -64,7 +64,7 @@ def stuck(at: slice) -> tuple[IkResult, IkResult]:
 
 
 @pytest.mark.parametrize("at", [slice(21, 22), slice(10, 30), slice(0, 40)])
-def test_local_minima_of_an_instant_a_part_or_a_whole_trial_are_left(at: slice) -> None:
+def test_local_minima_of_an_instant_a_part_or_a_whole_trial_are_corrected(at: slice) -> None:
     right, wrong = stuck(at)
     assert tracking_error(wrong.residuals[at]) > 2.0 * tracking_error(right.residuals[at])
     found, improved = restart_local_minima(chain(), trial(), None, wrong, OPTIONS)

@@ -52,7 +52,7 @@ def thigh_off_deg(model: ChainModel, a: ChainState, b: ChainState) -> float:
     return float(np.degrees(np.abs(step_between(model, a, b)[:, :3]).max()))
 
 
-def test_one_marker_on_a_segment_leaves_its_turn_open_and_its_parent_right() -> None:
+def test_one_marker_on_a_segment_leaves_its_rotation_undetermined_and_its_parent_correct() -> None:
     model = leg()
     truth = bending(model)
     y = marker_positions(model, truth)
@@ -87,7 +87,7 @@ def test_a_segment_without_markers_is_reported_and_stays(missing: list[int]) -> 
     assert np.isnan(found.residuals[:, missing]).all()
     assert np.isfinite(found.origins).all()
     assert tracking_error(found.residuals) < 1e-3
-    if missing == SHANK:  # nothing moves what nothing shows
+    if missing == SHANK:  # a segment without markers does not move
         knee = np.diff(found.state.rotations[:, 1], axis=0)
         assert np.abs(knee).max() < 1e-6
 

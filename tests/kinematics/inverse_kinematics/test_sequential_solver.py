@@ -130,7 +130,7 @@ def test_a_subject_returning_rotated_is_found_again() -> None:
     assert max(np.abs(p.residuals).max() for p in poses[5:]) < 3e-3
 
 
-def test_a_stray_marker_is_weighed_down() -> None:
+def test_huber_weights_reduce_the_effect_of_a_stray_marker() -> None:
     model = limb()
     truth = swing(model)
     y = noisy(model, truth)
@@ -182,7 +182,7 @@ def hostile(y: np.ndarray) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("fault", hostile(np.zeros((40, 8, 3))))
 @pytest.mark.parametrize("huber_m", [None, 0.02])
-def test_no_markers_make_an_instant_evaluate_its_errors_often(
+def test_the_number_of_evaluations_is_limited_for_any_markers(
     fault: str, huber_m: float | None
 ) -> None:
     model = limb()

@@ -101,7 +101,7 @@ def test_sums_over_segments_are_the_dense_normal_equations(seed: int) -> None:
 
 
 @pytest.mark.parametrize("heading", [0.0, 1.5, 3.1, -2.0])
-def test_true_markers_give_back_the_true_pose_from_nowhere(heading: float) -> None:
+def test_true_markers_determine_the_pose_without_a_start(heading: float) -> None:
     model = leg()
     truth = walk(model, heading=heading)
     found = solve_frames(model, marker_positions(model, truth))
@@ -109,6 +109,19 @@ def test_true_markers_give_back_the_true_pose_from_nowhere(heading: float) -> No
     assert not found.underdetermined.any()
     assert np.abs(turns_off(model, truth, found.state)).max() < 1e-9
     assert tracking_error(found.residuals) < 1e-10
+
+
+def test_an_instant_without_a_better_step_has_not_converged() -> None:
+    # The markers pull the knee beyond half a turn, where the excess over its limit jumps upwards.
+    model, count = leg(), 20
+    step, begin = np.zeros((2, count, model.nq))
+    step[:, 9], begin[:, 9] = -4.0, np.linspace(-3.1, -2.4, count)
+    rest = rest_state(model, count)
+    markers = marker_positions(model, apply_step(model, rest, step))
+    start = apply_step(model, rest, begin)
+    found = solve_frames(model, markers, start=start, options=IkOptions(limit_m2=0.1))
+    assert (found.iterations < IkOptions().iterations).any()  # the damping ended the search
+    assert not found.converged.any()
 
 
 def test_the_least_squares_are_those_of_an_independent_solver() -> None:
@@ -172,7 +185,7 @@ def test_a_trial_without_markers_is_underdetermined() -> None:
     assert np.isnan(tracking_error(found.residuals))
 
 
-def test_robust_weights_take_a_stray_marker_out() -> None:
+def test_robust_weights_exclude_a_stray_marker() -> None:
     model = leg()
     truth = walk(model)
     rng = np.random.default_rng(5)
@@ -188,7 +201,7 @@ def test_robust_weights_take_a_stray_marker_out() -> None:
     assert robust.weights[:, 6].max() < 0.1
 
 
-def test_limits_hold_a_hinge_only_when_they_weigh() -> None:
+def test_limits_restrict_a_hinge_only_if_they_have_a_weight() -> None:
     model = leg()
     beyond = np.zeros((1, model.nq))
     beyond[0, 9] = 0.6
