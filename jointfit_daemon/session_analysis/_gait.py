@@ -48,6 +48,8 @@ SAME_PACE = 0.3
 """Largest relative difference between the durations of two successive cycles."""
 CUTOFF_HZ = 6.0
 """Cut-off of the low-pass filter of the angular velocity, Hz (Winter 2009)."""
+_LEAST_HZ = 4.0 * CUTOFF_HZ
+"""Lowest sample rate of the shank at which the angular velocity is evaluated, Hz."""
 _GRID_HZ = 100.0
 """Highest rate at which the angular velocity is evaluated, Hz."""
 
@@ -102,8 +104,12 @@ def find_gait_cycles(shank: SegmentSeries) -> GaitCycles:
     shank
         Segment with x to the subject's right and z from the ankle to the knee (CONVENTIONS.md).
     """
+    parts = list(_sagittal_rates(shank))
+    if not parts:
+        return GaitCycles(shank.name, np.empty((0, 2)), _data_fault(shank))
+
     fastest, candidates, reasons = 0.0, list[tuple[float, float]](), list[str]()
-    for times, rates in _sagittal_rates(shank):
+    for times, rates in parts:
         fastest = max(fastest, float(rates.max()))
         for cycle in _candidates(times, rates):
             reason = _objection(times, rates, cycle)
@@ -128,12 +134,25 @@ def find_gait_cycles(shank: SegmentSeries) -> GaitCycles:
     return GaitCycles(shank.name, found, reason)
 
 
+def _data_fault(shank: SegmentSeries) -> str:
+    """Return the reason why a series has no part with a known angular velocity."""
+    rate_hz = sample_rate_hz(shank.t_s)
+    if rate_hz < _LEAST_HZ:
+        return (
+            f"the {shank.name} has {rate_hz:.1f} orientations per second, at least"
+            f" {_LEAST_HZ:.0f} are needed"
+        )
+    if not np.isfinite(shank.orientation).any():
+        return f"the orientation of the {shank.name} is unknown"
+    return f"the orientation of the {shank.name} is nowhere known for {SHORTEST_S} s without a gap"
+
+
 def _sagittal_rates(shank: SegmentSeries) -> Iterator[tuple[Array, Array]]:
     """Yield times and filtered forward rotation rate of the shank, rad/s, for each gapless part."""
     if len(shank.t_s) < 2:  # noqa: PLR2004 - a rate needs two rows
         return
     rate_hz = min(sample_rate_hz(shank.t_s), _GRID_HZ)
-    if rate_hz < 4.0 * CUTOFF_HZ:
+    if rate_hz < _LEAST_HZ:
         return
     times = np.arange(shank.t_s[0], shank.t_s[-1], 1.0 / rate_hz)
     q = interpolate_orientations(shank.t_s, shank.orientation, times)

@@ -14,6 +14,7 @@ from jointfit_daemon.session_data._resampling import (
     uniform_times,
 )
 from jointfit_daemon.session_data._series import (
+    FrameSeries,
     JointSeries,
     MarkerSeries,
     SegmentSeries,
@@ -24,6 +25,7 @@ from jointfit_daemon.session_data._series import (
 from jointfit_daemon.session_data._session import SessionData
 
 __all__ = [
+    "FrameSeries",
     "JointSeries",
     "MarkerSeries",
     "SegmentSeries",

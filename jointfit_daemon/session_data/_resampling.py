@@ -26,7 +26,7 @@ UNIFORM_SHARE = 0.01
 """Largest deviation of an instant from a uniform time axis, in sample periods."""
 _EXACT_SHARE = 1e-6
 """Largest distance between an instant and a row, in sample periods, at which the value of the row
-is returned without interpolation.
+is returned without interpolation. A series with a single row counts as one with a period of 1 s.
 """
 
 
@@ -144,7 +144,7 @@ def _neighbours(t_s: Array, at_s: Array) -> tuple[NDArray[np.intp], NDArray[np.i
         return none, none, np.full(len(at_s), np.nan)
     last = len(t_s) - 1
     period = float(np.median(np.diff(t_s))) if last else np.inf
-    near = _EXACT_SHARE * min(period, 1.0)
+    near = _EXACT_SHARE * (period if last else 1.0)
 
     i = np.clip(np.searchsorted(t_s, at_s + near, side="right") - 1, 0, last)
     j = np.minimum(i + 1, last)

@@ -121,6 +121,26 @@ class JointSeries:
         _check_shape(owner, "position_sd", self.position_sd, (count,))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameSeries:
+    """Mode and flags of the frames that were computed from the sensors."""
+
+    t_s: Array
+    """Instants since the start of the session, s, shape (n,)."""
+    modes: tuple[str, ...]
+    """Mode of each frame, such as ``imu`` (`FusionMode`)."""
+    flags: tuple[str, ...]
+    """Flags of each frame (`FrameFlag`), separated by blanks; empty without flags."""
+
+    def __post_init__(self) -> None:
+        _check_times("frames", self.t_s)
+        if not len(self.t_s) == len(self.modes) == len(self.flags):
+            raise SessionDataError(
+                f"frames: {len(self.modes)} modes and {len(self.flags)} flags, expected"
+                f" {len(self.t_s)}: one of each for each time"
+            )
+
+
 @dataclass(frozen=True, slots=True)
 class TimelineEvent:
     """Event at an instant, such as a mark, a phase, a fault or a gap."""

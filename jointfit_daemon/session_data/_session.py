@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.session_data._series import (
+        FrameSeries,
         JointSeries,
         MarkerSeries,
         SegmentSeries,
@@ -46,6 +47,8 @@ class SessionData:
     """Events in the order of their instants."""
     description: Mapping[str, str] = field(default_factory=dict)
     """Origin of the data: rig, software, calibration and file."""
+    frames: FrameSeries | None = None
+    """Mode and flags of the frames from which `segments` and `joints` were taken."""
 
     def __post_init__(self) -> None:
         check_unique("sensors", tuple(sensor.id for sensor in self.sensors))
@@ -68,6 +71,8 @@ class SessionData:
             yield from (series.t_s for series in group)
         if self.markers is not None:
             yield self.markers.t_s
+        if self.frames is not None:
+            yield self.frames.t_s
 
     @property
     def duration_s(self) -> float:

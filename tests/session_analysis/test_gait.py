@@ -109,11 +109,31 @@ def test_no_cycle_extends_over_a_gap() -> None:
     assert not ((gait.cycles_s[:, 0] < 9.0) & (gait.cycles_s[:, 1] > 8.0)).any()
 
 
-def test_series_without_rows_or_values_is_refused() -> None:
-    empty = SegmentSeries("shank", np.empty(0), np.empty((0, 4)))
-    assert find_gait_cycles(empty).refused
-    t_s = np.arange(0.0, 5.0, 0.01)
-    assert find_gait_cycles(SegmentSeries("shank", t_s, np.full((len(t_s), 4), np.nan))).refused
+@pytest.mark.parametrize(
+    ("t_s", "w", "reason"),
+    [
+        (np.empty(0), 1.0, "the orientation of the shank is unknown"),
+        (np.arange(0.0, 5.0, 0.01), np.nan, "the orientation of the shank is unknown"),
+        (np.zeros(1), 1.0, "the orientation of the shank is nowhere known for 0.6 s without a gap"),
+        (
+            np.arange(0.0, 0.5, 0.01),
+            1.0,
+            "the orientation of the shank is nowhere known for 0.6 s without a gap",
+        ),
+        (
+            np.arange(0.0, 60.0, 0.05),
+            1.0,
+            "the shank has 20.0 orientations per second, at least 24 are needed",
+        ),
+    ],
+)
+def test_series_without_angular_velocity_is_refused_with_the_cause(
+    t_s: np.ndarray, w: float, reason: str
+) -> None:
+    q = w * np.tile([1.0, 0.0, 0.0, 0.0], (len(t_s), 1))
+    gait = find_gait_cycles(SegmentSeries("shank", t_s, q))
+    assert gait.cycles_s.shape == (0, 2)
+    assert gait.refused == reason
 
 
 def test_cycles_with_unknown_values_are_left_out() -> None:

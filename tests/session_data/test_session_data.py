@@ -94,7 +94,7 @@ def test_interpolation_agrees_with_an_independent_slerp(at: float, seed: int) ->
     found = interpolate_orientations(T_S, q.as_quat(scalar_first=True), np.array([at]))
     expected = Slerp(T_S, q)([at])
     apart = Rotation.from_quat(found, scalar_first=True) * expected.inv()
-    # Half turns have two shortest ways, of which either is right.
+    # A half turn has two shortest rotations, and both are correct.
     steps = (q[1:] * q[:-1].inv()).magnitude()
     assert apart.magnitude() < 1e-6 or steps.max() > np.pi - 1e-3
 
@@ -108,3 +108,12 @@ def test_rows_are_kept_and_gaps_are_not_bridged() -> None:
         interpolate_values(t_s, values, at), [nan, 0, 0.5, 1, nan, nan, nan, 5, 5.5, 6, nan]
     )
     assert np.isnan(interpolate_values(np.empty(0), np.empty((0, 3)), at)).all()
+
+
+@pytest.mark.parametrize("period_s", [0.1, 100.0])
+def test_a_row_within_a_millionth_of_a_period_is_kept(period_s: float) -> None:
+    t_s, values = period_s * np.arange(3.0), np.array([np.nan, 1.0, np.nan])
+    at = period_s * np.array([1.0 - 1e-5, 1.0 - 5e-7, 1.0, 1.0 + 5e-7, 1.0 + 1e-5])
+    found = interpolate_values(t_s, values, at)
+    assert np.isfinite(found).tolist() == [False, True, True, True, False]
+    assert (found[1:4] == 1.0).all()

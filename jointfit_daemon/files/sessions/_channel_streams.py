@@ -155,13 +155,14 @@ def session_of(
             continue
         for item in dict.fromkeys(channel.object for channel in stream.channels):
             found[stream.group].append(_series(stream, item))
+    series: dict[str, Any] = {group: tuple(found[group]) for group in GROUPS if group != "markers"}
     return SessionData(
         name,
         start_unix_ns,
         markers=markers,
         events=tuple(events),
         description=dict(description or {}),
-        **{group: tuple(found[group]) for group in GROUPS if group != "markers"},
+        **series,
     )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import orjson
 
 from jointfit_daemon.session_data import (
+    FrameSeries,
     JointSeries,
     MarkerSeries,
     SegmentSeries,
@@ -38,8 +39,8 @@ _INERTIAL = {
 }
 _XYZ = ("x_m", "y_m", "z_m")
 TEXT_COLUMNS = frozenset(
-    {"sensor", "segment", "marker", "source", "joint", "angle", "kind", "id", "text", "data",
-     "key", "value"}
+    {"sensor", "segment", "marker", "source", "joint", "angle", "mode", "flags", "kind", "id",
+     "text", "data", "key", "value"}
 )  # fmt: skip
 """Names of the columns that contain text; all other columns contain numbers."""
 TABLES: Mapping[str, tuple[str, ...]] = {
@@ -51,6 +52,7 @@ TABLES: Mapping[str, tuple[str, ...]] = {
     "segments": ("t_s", "source", "segment", *_Q, "sd_deg"),
     "angles": ("t_s", "source", "joint", "angle", "angle_deg", "sd_deg"),
     "positions": ("t_s", "source", "joint", *_XYZ, "sd_m"),
+    "frames": ("t_s", "mode", "flags"),
     "events": ("t_s", "kind", "id", "text", "data"),
 }  # fmt: skip
 """Columns of every table. Only the table ``session`` is present in every session."""
@@ -90,6 +92,7 @@ def tables_of(session: SessionData) -> dict[str, Table]:
             if joint.position is not None:
                 cells = _columns(_XYZ, joint.position) | {"sd_m": joint.position_sd}
                 parts["positions"].append(_fill_columns(head | cells))
+    parts["frames"] = _frame_tables(session.frames)
     if session.events:
         parts["events"].append(_event_table(session.events))
     return {
@@ -105,6 +108,14 @@ def _sensor_table(sensor: SensorSeries) -> Table:
     for name, columns in _INERTIAL.items():
         table |= _columns(columns, getattr(sensor, name))
     return _fill_columns(table)
+
+
+def _frame_tables(frames: FrameSeries | None) -> list[Table]:
+    """Return the table of the frames; empty without frames."""
+    if frames is None:
+        return []
+    modes, flags = np.array(frames.modes, object), np.array(frames.flags, object)
+    return [{"t_s": frames.t_s, "mode": modes, "flags": flags}]
 
 
 def _event_table(events: Sequence[TimelineEvent]) -> Table:
@@ -166,7 +177,7 @@ def session_of_tables(tables: Mapping[str, Table], name: str) -> SessionData:
             if found == source
         )
         series[f"{prefix}joints"] = tuple(_joints(tables, source))
-    start = facts.get(_START, "")
+    start, frames = facts.get(_START, ""), tables.get("frames")
     return SessionData(
         str(facts.get(_NAME, name)),
         int(start) if str(start).lstrip("-").isdecimal() else None,
@@ -177,6 +188,9 @@ def session_of_tables(tables: Mapping[str, Table], name: str) -> SessionData:
             for key, value in facts.items()
             if str(key).startswith(_DESCRIPTION)
         },
+        frames=None
+        if frames is None
+        else FrameSeries(frames["t_s"], tuple(frames["mode"]), tuple(frames["flags"])),
         **series,
     )
 

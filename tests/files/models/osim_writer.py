@@ -1,4 +1,4 @@
-"""Writes small OpenSim 4 models for tests: bodies in a row, joints and markers as asked."""
+"""Writes small OpenSim 4 models with given bodies, joints and markers."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def spline(x: list[float], y: list[float], scale: float = 1.0) -> str:
 
 @dataclass
 class Hung:
-    """One body and the joint it hangs on."""
+    """One body and the joint that connects it to its parent."""
 
     body: str
     parent: str
@@ -33,7 +33,7 @@ class Hung:
     """Translation and orientation of the joint's frame in the parent."""
     in_child: tuple[Triple, Triple] = ((0, 0, 0), (0, 0, 0))
     axes: list[tuple[str, Triple, str]] = field(default_factory=list)
-    """Of a CustomJoint: coordinate, axis, function."""
+    """Coordinate, axis and function of each transform axis of a CustomJoint."""
     locked: bool = False
 
 

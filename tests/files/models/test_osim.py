@@ -290,7 +290,7 @@ def test_bodies_that_no_marker_needs_are_left_out(tmp_path: Path) -> None:
         ("PlanarJoint", 3, "hinge"),
     ],
 )
-def test_every_kind_of_joint_becomes_one_of_ours(
+def test_every_kind_of_joint_is_converted(
     tmp_path: Path, kind: str, coordinates: int, expected: str
 ) -> None:
     named = [(f"q{i}", -1.0, 1.0) for i in range(coordinates)]
@@ -395,7 +395,7 @@ def test_millimetres_are_rejected_with_or_without_a_declared_unit(tmp_path: Path
         read_osim(path)
 
 
-def test_vectors_go_there_and_back() -> None:
+def test_vectors_survive_a_round_trip() -> None:
     v = np.arange(6.0).reshape(2, 3)
     assert to_z_up(v).tolist() == [[2.0, 0.0, 1.0], [5.0, 3.0, 4.0]]
     np.testing.assert_array_equal(from_z_up(to_z_up(v)), v)

@@ -1,4 +1,4 @@
-"""A session that holds everything."""
+"""A session with every kind of content."""
 
 from __future__ import annotations
 

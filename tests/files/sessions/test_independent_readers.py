@@ -1,4 +1,4 @@
-"""Files that are written are read as the same by libraries that are not ours."""
+"""Independent libraries read the same values from the written files."""
 
 from __future__ import annotations
 

@@ -1,10 +1,9 @@
-"""What a format holds is read back as it was: values, gaps, events, names and start."""
+"""Written sessions are read back unchanged, as far as the format contains their content."""
 
 from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -12,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from jointfit_daemon.files.sessions import read_session, write_session
+from jointfit_daemon.session_data import FrameSeries, SessionData
 from tests.files.sessions.session_strategy import (
     assert_same_group,
     assert_same_series,
@@ -21,12 +21,9 @@ from tests.files.sessions.session_strategy import (
     time_axes,
 )
 
-if TYPE_CHECKING:
-    from jointfit_daemon.session_data import SessionData
-
 FEW = settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
 WHOLE = {"csv": 1e-8, "parquet": 1e-12, "xdf": 1e-12, "bids-motion": 1e-8}
-"""Formats that hold everything, with their relative precision."""
+"""Formats that contain all kinds of content, with their relative precision."""
 GROUPS = ("sensors", "segments", "joints", "optical_segments", "optical_joints")
 
 
@@ -40,7 +37,7 @@ def there_and_back(session: SessionData, to: str, *, file: int = 0) -> SessionDa
 @pytest.mark.parametrize("to", WHOLE)
 @FEW
 @given(session=session_data())
-def test_a_whole_session_comes_back(to: str, session: SessionData) -> None:
+def test_a_whole_session_is_read_back_unchanged(to: str, session: SessionData) -> None:
     if to == "parquet":
         pytest.importorskip("pyarrow")
     found = there_and_back(session, to)
@@ -60,10 +57,25 @@ def test_a_whole_session_comes_back(to: str, session: SessionData) -> None:
     )
 
 
+@pytest.mark.parametrize("to", ["csv", "parquet"])
+def test_mode_and_flags_of_every_frame_come_back(to: str) -> None:
+    if to == "parquet":
+        pytest.importorskip("pyarrow")
+    frames = FrameSeries(
+        np.array([0.01, 0.02, 0.03]),
+        ("imu+mocap", "imu", "imu"),
+        ("", "held:thigh untrained:shank", ""),
+    )
+    found = there_and_back(SessionData("walk", frames=frames), to).frames
+    assert found is not None
+    np.testing.assert_allclose(found.t_s, frames.t_s, atol=1e-9)
+    assert (found.modes, found.flags) == (frames.modes, frames.flags)
+
+
 @pytest.mark.parametrize(("to", "precision"), [("trc", 1e-7), ("c3d", 2e-7)])
 @FEW
 @given(session=session_data())
-def test_markers_come_back(to: str, precision: float, session: SessionData) -> None:
+def test_markers_are_read_back_unchanged(to: str, precision: float, session: SessionData) -> None:
     if to == "c3d":
         pytest.importorskip("c3d")
     found = there_and_back(session, to)
@@ -79,7 +91,7 @@ def test_markers_come_back(to: str, precision: float, session: SessionData) -> N
 
 @FEW
 @given(st.data())
-def test_orientations_come_back_with_their_gaps(data: st.DataObject) -> None:
+def test_orientations_are_read_back_with_their_gaps(data: st.DataObject) -> None:
     session = data.draw(session_data(axis=data.draw(time_axes())))
     for group in ("sensors", "segments", "optical_segments"):
         with tempfile.TemporaryDirectory() as folder:
@@ -99,7 +111,7 @@ def test_orientations_come_back_with_their_gaps(data: st.DataObject) -> None:
 
 @FEW
 @given(st.data())
-def test_joints_come_back_if_all_is_known(data: st.DataObject) -> None:
+def test_joints_are_read_back_if_all_values_are_known(data: st.DataObject) -> None:
     session = data.draw(session_data(axis=data.draw(time_axes()), gaps=False))
     for group, file in (("joints", 0), ("optical_joints", 1)):
         with tempfile.TemporaryDirectory() as folder:
