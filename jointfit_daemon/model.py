@@ -307,7 +307,6 @@ class FrameFlag(StrEnum):
     """A limitation of a limb state; docs/mqtt.md explains each."""
 
     UNCALIBRATED = "uncalibrated"
-    OTHER_CHAIN = "other_chain"
     HEADINGS_FROM_STATIC = "headings_from_static"
     SAME_POSE_ASSUMED = "same_pose_assumed"
     FACING_UNKNOWN = "facing_unknown"

@@ -57,8 +57,7 @@ class LimbFuser:
     chain : Chain
         Joints, segments and sensors of the rig.
     calibration : Calibration or None
-        If it is None or belongs to another chain (flag ``other_chain``), every state is
-        ``uncalibrated``.
+        If it is None or belongs to another chain, every state is ``uncalibrated``.
     sensor_monitor : SensorMonitor, optional
         Existing monitor to use, so that a change of the calibration does not reset the sensor
         states.
@@ -82,8 +81,6 @@ class LimbFuser:
         """Whether sensors are used without correction, even if they have faults."""
         self._calibration = calibration if usable else None
         self._base_flags: tuple[str, ...] = (FrameFlag.UNCALIBRATED,)
-        if calibration is not None and not usable:
-            self._base_flags += (FrameFlag.OTHER_CHAIN,)
         self._fusers: list[SegmentFuser] = []
         self._lengths: list[SegmentLength] = []
         self._alignments: list[tuple[str, Quaternion, Quaternion]] = []
@@ -155,7 +152,7 @@ class LimbFuser:
         -----
         The flags have this order:
 
-        1. ``uncalibrated`` and ``other_chain``, or the flags of the calibration;
+        1. ``uncalibrated``, or the flags of the calibration;
         2. ``uncorrected`` in the procedure of the patent, where the following fault flags only
            report the faults, and the sensors are used without correction;
         3. ``extrapolating`` if an orientation is extrapolated in time;

@@ -129,7 +129,8 @@ def _find_axes(q: Array) -> tuple[str, str] | None:
 
     # Rotations 1 and 3 are about the vertical, so their axes in the world must be equal.
     up, up_again = world[0] / turned[0], world[2] / turned[2]
-    if np.arccos(np.clip(up @ up_again, -1.0, 1.0)) > TOLERANCE_RAD:
+    between = np.arctan2(np.linalg.norm(np.cross(up, up_again)), up @ up_again)
+    if between > TOLERANCE_RAD:
         return None
     printed = np.stack((sensor[1], sensor[2], sensor[0])) / turned[[1, 2, 0], None]
 

@@ -162,6 +162,8 @@ class _ChangedRun:
             self._in_force = recorded if recorded and recorded.fits(rig.chain) else None
             version = event.calibration_version if self._in_force else None
             return replace(event, rig=rig, calibration=self._in_force, calibration_version=version)
+        if self._in_force is not None and not self._in_force.fits(rig.chain):
+            self._in_force = event.calibration  # the reload changed the limb
         return replace(event, calibration=self._in_force, calibration_version=None)
 
     def _pass_on(self, event: Event) -> Iterator[tuple[Event, list[Output]]]:

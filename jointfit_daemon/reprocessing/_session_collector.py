@@ -8,8 +8,10 @@ not later than the previous row are omitted, because a clock that settles or res
 from __future__ import annotations
 
 from array import array
+from dataclasses import replace
 from math import nan
 from operator import itemgetter
+from sys import intern
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,6 +26,7 @@ from jointfit_daemon.model import (
 )
 from jointfit_daemon.pipeline.events import CalibrationStatus, ChunkArrived, Notice, UnixOffset
 from jointfit_daemon.session_data import (
+    FrameSeries,
     JointSeries,
     MarkerSeries,
     SegmentSeries,
@@ -34,7 +37,7 @@ from jointfit_daemon.session_data import (
 from jointfit_daemon.units import NS_PER_S
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.config import Rig
@@ -94,6 +97,9 @@ class SessionCollector:
         self._joints: dict[str, tuple[AngleConvention, _Rows]] = {}
         self._optical_segments: dict[str, _Rows] = {}
         self._optical_joints: dict[str, tuple[AngleConvention, _Rows]] = {}
+        self._states_ns = array("q")
+        self._modes: list[str] = []
+        self._flags: list[str] = []
         self._latencies_ns = array("q")
         self._measured_origins: list[bool] = []
         """For each limb state, whether cameras measured the position of the limb."""
@@ -138,6 +144,10 @@ class SessionCollector:
 
     def _add_state(self, state: LimbState) -> None:
         self._latencies_ns.append(state.completed_ns - state.t_ns)
+        if not self._states_ns or state.t_ns > self._states_ns[-1]:
+            self._states_ns.append(state.t_ns)
+            self._modes.append(state.mode.value)
+            self._flags.append(intern(" ".join(state.flags)))  # most frames have the same flags
         for segment in state.segments:
             self._segments.setdefault(segment.name, _Rows(5)).add(
                 state.t_ns, segment.q_world_segment or _UNKNOWN_Q, (_number(segment.sd),)
@@ -208,7 +218,6 @@ class SessionCollector:
             Description of the origin of the data.
         """
         begin_ns = self._begin_ns or 0
-        timeline = sorted([*self._position_events(begin_ns), *self._events], key=itemgetter(0))
         segments = {
             name: segment
             for segment, group in zip(rig.chain.segments, rig.chain.sensors, strict=True)
@@ -246,14 +255,22 @@ class SessionCollector:
                 _joint_series(name, convention, rows, begin_ns, sds=False)
                 for name, (convention, rows) in self._optical_joints.items()
             ),
-            events=tuple(
-                TimelineEvent(
-                    (t_ns - begin_ns) / NS_PER_S, item.kind, item.id, item.text, item.data
-                )
-                for t_ns, item in timeline
-            ),
+            events=tuple(self._timeline(begin_ns)),
             description=description,
+            frames=self._frame_series(begin_ns),
         )
+
+    def _frame_series(self, begin_ns: int) -> FrameSeries | None:
+        if not self._states_ns:
+            return None
+        t_s = (np.array(self._states_ns, dtype=np.int64) - begin_ns) / NS_PER_S
+        return FrameSeries(t_s, tuple(self._modes), tuple(self._flags))
+
+    def _timeline(self, begin_ns: int) -> Iterator[TimelineEvent]:
+        """Yield the events in the order of their instants, which are relative to the start."""
+        events = sorted([*self._position_events(begin_ns), *self._events], key=itemgetter(0))
+        for t_ns, event in events:
+            yield replace(event, t_s=(t_ns - begin_ns) / NS_PER_S)
 
     def _position_events(self, begin_ns: int) -> list[tuple[int, TimelineEvent]]:
         """Return one event if the cameras measured the limb's position in only some frames."""

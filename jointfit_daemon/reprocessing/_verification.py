@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import orjson
 
+from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.model import LimbState
 from jointfit_daemon.outputs.recording import (
     PROGRAM,
@@ -350,7 +351,7 @@ def _orientation_errors(
     for name, (t_s, q) in recorded.items():
         if name in replayed:
             other = interpolate_orientations(*replayed[name], t_s)
-            cosine = np.abs((q * other).sum(axis=1))
-            found.append(2.0 * np.arccos(np.clip(cosine[np.isfinite(cosine)], 0.0, 1.0)))
+            angles = rotation.angle_between(q, other)
+            found.append(angles[np.isfinite(angles)])
     errors: Array = np.concatenate(found) if found else np.empty(0)
     return errors

@@ -52,7 +52,7 @@ def test_new_models_fade_in_within_a_second() -> None:
     states += [fuse(fuser, k) for k in range(10, 130)]
     steps = [angle_between_one(thigh(a), thigh(b)) for a, b in pairwise(states)]
     whole = angle_between_one(thigh(states[0]), thigh(states[-1]))
-    assert whole > np.deg2rad(0.5)  # there is something to fade
+    assert whole > np.deg2rad(0.5)  # the models differ
     assert max(steps) < 0.012 * whole
     fresh_start = LimbFuser(CHAIN, learned())
     assert angle_between_one(thigh(fuse(fresh_start, 0)), thigh(states[-1])) < 1e-9

@@ -233,7 +233,7 @@ def test_coefficients_in_force_are_the_verified_ones_for_all_sensors_only() -> N
 
 def test_new_static_pose_defines_the_segments_as_unrotated_again() -> None:
     used = calibration()
-    turned = replace(SUBJECT, facing=0.1)  # the subject stands otherwise; the patent ignores it
+    turned = replace(SUBJECT, facing=0.1)  # the subject has another pose, which the patent ignores
     trial = record(turned, motion(turned, 6.0, 400.0, still=True), 9)
     pose = fit_static(trial, replace(SETTINGS, procedure="patent"), STATIC_CHAIN)
     again = with_new_static(used, pose)

@@ -23,7 +23,7 @@ HANDS = st.lists(st.floats(-5.0, 5.0), min_size=12, max_size=12)
 
 
 def poses(heading_deg: float, hand_deg: list[float]) -> Rotation:
-    """Orientations, sensor to ENU, before and after the three rotations."""
+    """Return the orientations, sensor to ENU, before and after each of the three rotations."""
     turns = [
         Rotation.from_euler("z", heading_deg, degrees=True),
         Rotation.from_euler("z", 90, degrees=True),

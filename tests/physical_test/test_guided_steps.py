@@ -1,4 +1,4 @@
-"""The steps of a physical test, and the settings that it proposes, on a made-up sensor."""
+"""The steps of a physical test, and the settings that it proposes, with a fake sensor."""
 
 from __future__ import annotations
 

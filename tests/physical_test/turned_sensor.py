@@ -1,4 +1,4 @@
-"""A made-up sensor whose four bytes are a quaternion of a guided test, with times of its own."""
+"""A fake sensor that is rotated as the physical test requires; each chunk is a quaternion."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PERIOD_S, REST_S, TURN_S = 0.02, 1.5, 0.5
 
 
 class TurnedSettings(BaseModel):
-    """Its table of rig.toml."""
+    """Settings of the sensor in rig.toml."""
 
     direction: Literal["sensor_to_world", "world_to_sensor"] = "sensor_to_world"
 
@@ -36,18 +36,18 @@ class TurnedDecoder:
         self._inverse = settings.direction == "world_to_sensor"
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return one sample a chunk."""
+        """Return one sample for each chunk."""
         native = np.frombuffer(chunk.data)
         q = rotation.conjugate(native) if self._inverse else native
         return [ImuSample(chunk.t_ns, _tuple(q), _tuple(native), None, None)]
 
     def flush(self) -> list[Decoded]:
-        """Nothing is pending."""
+        """Return nothing, because nothing is pending."""
         return []
 
 
 class TurnedSensor:
-    """Its driver."""
+    """Driver of the sensor."""
 
     def __init__(self, settings: TurnedSettings) -> None:
         self._settings = settings
@@ -72,7 +72,7 @@ def guided_poses() -> list[Rotation]:
 
 
 def guided_chunks(poses: list[Rotation] | None = None) -> Iterator[Chunk]:
-    """Yield the chunks of a sensor that rests in each pose and sends sensor to world."""
+    """Yield the chunks of a sensor that rests in each pose; the quaternions are sensor to world."""
     poses = guided_poses() if poses is None else poses
     times = [0.0]
     for _ in poses:

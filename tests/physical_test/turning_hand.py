@@ -1,4 +1,4 @@
-"""A hand that turns a simulated sensor as the physical test asks for it."""
+"""Rotates a simulated sensor as the instructions of the physical test require."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Hand:
 
 @asynccontextmanager
 async def held(folder: Path, **sent: Any) -> AsyncIterator[Hand]:
-    """A hand with a device of these settings, and rig.toml with the default ones."""
+    """Run a device with these settings and a rig.toml with default settings; yield the hand."""
     keys = "\n".join(
         f'[[imu]]\nid = "{name}"\nsegment = "{segment}"\ndriver = "witmotion"\nport = "{path}"\n'
         "rate_hz = 100\n"

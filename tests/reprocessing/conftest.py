@@ -1,4 +1,4 @@
-"""The recorded run, made once: no test changes it."""
+"""The recorded run, which is created once, because no test changes it."""
 
 from __future__ import annotations
 

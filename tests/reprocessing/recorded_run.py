@@ -67,7 +67,7 @@ class RecordingBench(Bench):
             self.recorder.output(output)
 
     def flush(self) -> None:
-        """Write what waits, as the thread of the recorder does twice per second."""
+        """Write pending events, as the thread of the recorder does twice per second."""
         writer = self.recorder._writer
         assert writer is not None
         writer.write(self.recorder._take())

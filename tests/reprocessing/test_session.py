@@ -18,8 +18,8 @@ from jointfit_daemon.model import (
     SyncState,
 )
 from jointfit_daemon.outputs.recording import PROGRAM, _session_writer
-from jointfit_daemon.pipeline.events import Tick
-from jointfit_daemon.reprocessing import ReprocessingError, load_session
+from jointfit_daemon.pipeline.events import Configured, Tick
+from jointfit_daemon.reprocessing import Changes, ReprocessingError, load_session, process_events
 from jointfit_daemon.reprocessing._session_collector import SessionCollector
 from tests.pipeline import core_feed
 from tests.pipeline.core_feed import BEGIN_NS, SENSORS
@@ -119,6 +119,10 @@ def test_positions_from_the_fixed_origin_are_unknown_beside_measured_positions()
     (event,) = found.events
     assert event.kind == "positions"
     assert "in 2 of 4 frames" in event.text
+    assert found.frames is not None
+    assert found.frames.t_s.tolist() == joint.t_s.tolist()
+    assert found.frames.modes == ("imu+mocap", "imu+mocap", "imu", "imu+mocap")
+    assert found.frames.flags == ("", "origin_fixed", "", "")
 
 
 def test_calibration_given_is_in_force_from_the_first_frame(run: RecordedRun) -> None:
@@ -157,3 +161,14 @@ def test_calibration_of_another_limb_is_an_error(run: RecordedRun) -> None:
     other = replace(run.calibration, segments=("thorax", "arm"))
     with pytest.raises(ReprocessingError, match="belongs to another limb"):
         load_session(run.path, calibration=other)
+
+
+def test_a_reload_with_another_limb_ends_the_use_of_the_calibration(run: RecordedRun) -> None:
+    rig = parse_rig(rig_table())
+    other = replace(rig, chain=replace(rig.chain, segments=("upper_arm", "forearm")))
+    recorded = [Configured(BEGIN_NS, rig, run.calibration), Configured(BEGIN_NS + 1, other, None)]
+    processed = [event for event, _ in process_events(recorded, Changes(compute_fits=True))]
+    assert [getattr(event, "calibration", "absent") for event in processed] == [
+        run.calibration,
+        None,
+    ]

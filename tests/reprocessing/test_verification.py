@@ -160,3 +160,12 @@ def test_recording_without_outputs_does_not_pass(tmp_path: Path) -> None:
     recorder.event(Configured(BEGIN_NS, parse_rig(rig_table()), None))
     recorder.close()
     assert not verify_recording(tmp_path).passed
+
+
+def test_the_angle_between_nearly_equal_orientations_has_full_precision() -> None:
+    angle, t_s = 1e-6, np.arange(3.0)
+    turned = np.tile([np.cos(0.5 * angle), np.sin(0.5 * angle), 0.0, 0.0], (3, 1))
+    same = np.tile([1.0, 0.0, 0.0, 0.0], (3, 1))
+    same[1] = np.nan
+    errors = _verification._orientation_errors({"thigh": (t_s, same)}, {"thigh": (t_s, turned)})
+    np.testing.assert_allclose(errors, [angle, angle], rtol=1e-9)

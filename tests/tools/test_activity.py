@@ -1,4 +1,4 @@
-"""The moving bar: seen on a terminal, absent from pipes, gone after an error."""
+"""The activity bar: shown on a terminal, absent from pipes, removed after an error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`jointfit recover` writes a clean file, lists what is missing, and leaves its source alone."""
+"""`jointfit recover` writes a clean file, lists the gaps, and does not change its source."""
 
 from __future__ import annotations
 

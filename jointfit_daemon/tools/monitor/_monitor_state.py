@@ -295,7 +295,7 @@ def _words_of(command: str, answer: Mapping[str, Any]) -> str:
     if command == "mark":
         return f"mark {data.get('number')}: {done}"
     if command == "use-calibration":
-        return f"version {data.get('version')} is in force again, as a copy: {done}"
+        return f"version {data.get('version')} is in force: {done}"
     if command in {"calibrate", "static"}:
         return f"{data.get('phase', 'static')} phase: {done}"
     if command == "record":

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture(scope="session", autouse=True)
 def process_tracker() -> None:
-    """Start the tracker of processes, whose pipe stays open for as long as this process."""
+    """Start the resource tracker of multiprocessing, whose pipe stays open until the exit."""
     resource_tracker.ensure_running()
 
 
@@ -31,7 +31,7 @@ def recorded_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def recordings(recorded_file: Path, tmp_path: Path) -> Callable[[int], Path]:
-    """Return a function that makes a folder of so many recordings of one subject."""
+    """Return a function that creates a folder with a number of copies of one recording."""
 
     def make(count: int) -> Path:
         folder = tmp_path / "trials"

@@ -1,4 +1,4 @@
-"""Stand-in for the processing of a recording, in processes that die or wait."""
+"""Replacement for the processing of a recording; the process waits, or dies."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ SLOW_S = 0.2
 
 
 def process_or_die(task: RecordingTask) -> RecordingResult:
-    """End the process at a recording with a deadly name."""
+    """Wait, or end the process if the name of the recording contains `deadly`."""
     if "deadly" in task.name:
         os._exit(9)
     time.sleep(SLOW_S)

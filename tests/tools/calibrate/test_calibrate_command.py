@@ -121,7 +121,7 @@ async def request_twice(rig: Path, listener: Listener) -> None:
     output = await rest_of(second)
     assert second.returncode == 1
     assert "--abort" in output
-    assert phase_of(listener) == "static"  # another's phase is left alone
+    assert phase_of(listener) == "static"  # the phase of another client continues
 
     ending = await calibrate(rig, "--abort")
     assert "aborted" in await rest_of(ending)

@@ -1,4 +1,4 @@
-"""A simulated x-IMU3 with sensor errors, moved by a script as the guide asks."""
+"""A simulated x-IMU3 with sensor errors, moved by a script as the guide requires."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def recorded_chunks(steps: dict[str, float]) -> Iterator[Chunk]:
 
 
 class MovingHand:
-    """Moves a live device: begins the movement of a step at its instruction."""
+    """Moves a live device; the movement of a step begins at the instruction of the step."""
 
     def __init__(self, device: XImu3Device) -> None:
         self._device, self._step, self._begin_ns = device, "gyroscope", time.monotonic_ns()
@@ -147,7 +147,7 @@ class MovingHand:
 
 @asynccontextmanager
 async def held(folder: Path) -> AsyncIterator[MovingHand]:
-    """A hand with a device, and its rig.toml."""
+    """Write rig.toml, run a device, and yield the hand that moves the device."""
     (folder / "rig.toml").write_text(RIG.format(port=folder / "imu"), encoding="utf-8")
     stored = {
         "serial_mode": 1, "ahrs_message_rate_divisor": 0, "inertial_message_rate_divisor": 4,

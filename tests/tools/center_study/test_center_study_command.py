@@ -26,7 +26,7 @@ def test_study_contains_its_setup_both_tables_and_every_limitation(tmp_path: Pat
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
     out = tmp_path / "made" / "here"
     asked = [*SHORT, "--seed", "7", "--out", str(out), "--json", str(tmp_path / "a.json")]
-    result = subprocess.run(  # a process of its own: matplotlib keeps its fonts open
+    result = subprocess.run(  # in a new process, because matplotlib keeps its fonts open
         [sys.executable, "-m", "jointfit_daemon.tools", *asked],
         capture_output=True,
         encoding="utf-8",

@@ -100,7 +100,7 @@ async def chromium() -> AsyncIterator[Browser]:
 async def opened(
     browser: Browser, url: str, *, size: str = "desktop", scheme: str = "light"
 ) -> AsyncIterator[OpenedPage]:
-    """Yield the page in a window of its own."""
+    """Yield the page in a new window."""
     width, height = SIZES[size]
     context = await browser.new_context(
         viewport={"width": width, "height": height},

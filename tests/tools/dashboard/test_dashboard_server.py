@@ -98,7 +98,7 @@ async def test_no_path_leaves_the_folder_of_the_page(path: str) -> None:
      ("Localhost:1", 200), ("[::1]:8080", 200), ("rig.lab", 200)],
 )  # fmt: skip
 async def test_the_server_answers_to_its_own_names_only(host: str, status: int) -> None:
-    """A name of another site that resolves to this machine would share the page's origin."""
+    """Names of other sites that resolve to this machine are refused, as they share the origin."""
     async with DashboardServer(NOWHERE, names=("rig.lab",)).listening(LISTEN) as url:
         assert (await get(url, Host=host))[0] == status
 

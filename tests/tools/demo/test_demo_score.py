@@ -67,7 +67,7 @@ def figures(**changed: object) -> dict[str, Any]:
     return good | changed
 
 
-def test_figures_within_all_promises_miss_none() -> None:
+def test_results_within_all_targets_miss_none() -> None:
     assert missed_targets(figures()) == []
 
 
@@ -82,7 +82,7 @@ def test_figures_within_all_promises_miss_none() -> None:
         {"latency_ms": {"p50": None, "p99": None}},
     ],
 )
-def test_a_promise_that_is_broken_or_unknown_is_named(worse: dict[str, object]) -> None:
+def test_a_missed_or_unknown_target_is_named(worse: dict[str, object]) -> None:
     assert len(missed_targets(figures(**worse))) == 1
 
 
@@ -92,7 +92,7 @@ def test_samples_without_an_outcome_are_named_by_source_with_the_usual_cause() -
 
 
 @pytest.mark.parametrize("joint", ["elbow", "lumbar", "right_knee"])
-def test_another_limb_is_judged_by_its_own_joint(joint: str) -> None:
+def test_another_limb_is_evaluated_by_its_own_joint(joint: str) -> None:
     good = figures()
     del good["knee_flexion_rmse_deg"]
     key = f"{joint}_flexion_rmse_deg"

@@ -90,7 +90,7 @@ async def test_a_phase_that_a_busy_computer_ended_is_repeated() -> None:
     assert daemon.requests == ["align"] * 3
 
 
-async def test_a_phase_that_ends_without_result_each_time_is_given_up() -> None:
+async def test_a_phase_that_ends_without_result_each_time_is_not_repeated_further() -> None:
     daemon = AbortingDaemon(*[RESTARTED] * 9)
     with pytest.raises(PhaseAbortedError, match="S1 restarted"):
         await daemon.align()

@@ -1,4 +1,4 @@
-"""Trees of sysfs, procfs and /dev as on a gateway: for hardware that no test machine has."""
+"""Trees of sysfs, procfs and /dev as on a gateway with hardware that the test machine lacks."""
 
 from __future__ import annotations
 

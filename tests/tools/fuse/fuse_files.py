@@ -1,4 +1,4 @@
-"""Trials as files for `jointfit fuse`: a leg whose sensors ride on skin, standing and moving."""
+"""Trials as files for `jointfit fuse`: a leg with soft-tissue artefact, standing and moving."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def run(*arguments: object) -> Any:
 
 
 def said(result: Any) -> str:
-    """Return what went to stderr of a refused command, on one line."""
+    """Return the text on stderr of a refused command, on one line."""
     assert result.exit_code == 2, result.output
     return " ".join(result.stderr.split())
 
@@ -53,7 +53,7 @@ def limb(k: int) -> tuple[Array, Array]:
 
 
 def movement(k: int = 0, *, tissue: float = 0.1) -> OrientationTrial:
-    """Return a trial whose sensors ride on skin that moves with the knee."""
+    """Return a trial with soft-tissue artefact that is proportional to the knee rotation."""
     thigh, shank = limb(k)
     rng = np.random.default_rng(k)
     joint = rotation.log(rotation.multiply(rotation.conjugate(thigh), shank))
@@ -103,7 +103,7 @@ def as_trc(
 ) -> None:
     """Write markers on the bones, sampled at another rate, y up.
 
-    `scale` is of the file's unit, `stretch` of the distances between the markers.
+    `scale` is the factor of the unit of the file, `stretch` that of the distances of the markers.
     """
     t_s = np.arange(0.0, trial.t_s[-1], 1.0 / rate_hz)
     names, positions = [], []

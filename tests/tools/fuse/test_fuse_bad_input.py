@@ -64,7 +64,7 @@ def test_q_and_minus_q_mixed_at_random_change_nothing(files: Path) -> None:
         assert found == pytest.approx(before[key], abs=1e-9), key
 
 
-def test_a_reference_missing_half_of_the_time_still_teaches(files: Path) -> None:
+def test_a_reference_missing_half_of_the_time_suffices_for_training(files: Path) -> None:
     for k in range(2):
         trial = movement(k)
         for q in trial.bones.values():
@@ -95,7 +95,7 @@ def test_sensor_without_samples_is_named(files: Path) -> None:
     assert "--segment" in text
 
 
-def test_a_sensor_unplugged_half_of_the_time_still_teaches(files: Path) -> None:
+def test_a_sensor_unplugged_half_of_the_time_suffices_for_training(files: Path) -> None:
     trial = movement(0)
     trial.sensors["B"][N // 2 :] = np.nan
     rewrite(files, "m0", trial)

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 
-def test_every_method_is_judged_on_every_trial_left_out(files: Path) -> None:
+def test_every_method_is_evaluated_on_every_held_out_trial(files: Path) -> None:
     result = run("evaluate", *trials(files), *LIMB, "--static", files / "still.npz", "--json")
     found = rows(result)
     methods = {method for _, method in found}
@@ -57,7 +57,7 @@ def test_every_method_is_judged_on_every_trial_left_out(files: Path) -> None:
         assert best["segments_rms"]["thigh"] < 0.5 * mean["segments_rms"]["thigh"]
 
 
-def test_a_single_trial_is_judged_on_its_end(files: Path) -> None:
+def test_a_single_trial_is_evaluated_on_its_last_part(files: Path) -> None:
     options = ["--static", files / "still.npz", "--holdout", "0.25", "--json"]
     result = run("evaluate", files / "m1.npz", *LIMB, *options)
     assert json.loads(result.stdout)["judged_on"].startswith("the last 25 %")

@@ -13,12 +13,12 @@ from jointfit_daemon.tools.init import _search
 
 @pytest.fixture(autouse=True)
 def fast_drivers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Search the installed packages for drivers once: a dialogue checks a rig for each answer."""
+    """Search the installed packages for drivers once, because each answer causes a check."""
     monkeypatch.setattr(_load, "find_driver", cache(driver.find_driver))
 
 
 @pytest.fixture
 def one_driver_of_each_kind(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Offer one driver for UARTs, one for CAN and one for cameras: no question which one."""
+    """Offer one driver each for UARTs, CAN and cameras, so that the dialogue asks for no driver."""
     installed = [(name, driver.find_driver(name)) for name in ("natnet", "xbus", "xcdi")]
     monkeypatch.setattr(_search, "installed_drivers", lambda: iter(installed))

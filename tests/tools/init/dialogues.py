@@ -31,7 +31,7 @@ NOTHING = Found(
     ),
     mocap_drivers=(MocapDriver("natnet", 1510),),
 )
-"""The drivers of this project, and no device."""
+"""Drivers without any found device."""
 DEVICES = replace(
     NOTHING,
     ports=tuple(FoundDevice(f"/dev/ttyUSB{k}", "adapter") for k in range(3)),
@@ -85,7 +85,7 @@ def answer_or_default(asked: Asked, given: Any, answers: Answers, found: Found) 
 def completed(
     found: Found, choose: Callable[[Asked], Any], answers: Answers | None = None
 ) -> Answers:
-    """Return a complete dialogue: of each question the chosen answer, the default or a stand-in."""
+    """Return the answers to all questions: the chosen answer, the default or a placeholder."""
     given = dict(answers or {})
     while (asked := next_question(given, found)) is not None:
         extended = answer_or_default(asked, choose(asked), given, found)

@@ -199,7 +199,7 @@ def test_millimetres_called_metres_are_refused(folder: Path) -> None:
 def test_a_plot_is_drawn(folder: Path) -> None:
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
     command = [sys.executable, "-m", "jointfit_daemon.tools", *asked(folder)]
-    done = subprocess.run(  # a process of its own: matplotlib keeps its fonts open
+    done = subprocess.run(  # in a new process, because matplotlib keeps its fonts open
         [*command, "--plot", str(folder / "a.png")], capture_output=True, check=False
     )
     assert done.returncode == 0, done.stderr

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _SEQUENCE = re.compile(
     r"\x1b\[([?>=<]?)([\d;:]*)([ -/]*)([@-~])"  # control sequences
-    r"|\x1b[\]P_].*?(?:\x07|\x1b\\)|\x1b[()].|\x1b[^\[\]P_()]"  # others: without effect here
+    r"|\x1b[\]P_].*?(?:\x07|\x1b\\)|\x1b[()].|\x1b[^\[\]P_()]"  # other sequences have no effect
     r"|([\r\n])|([^\x1b\r\n]+)",
     re.DOTALL,
 )

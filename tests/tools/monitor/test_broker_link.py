@@ -81,7 +81,7 @@ async def test_the_only_rig_is_shown_and_a_lost_broker_is_named(broker: Broker) 
         assert str(broker.port) in state.reason
         broker.start()
         await until(lambda: state.link == "connected")
-        assert state.rig.bridge == "unknown"  # the broker forgot; the daemon will send it again
+        assert state.rig.bridge == "unknown"  # the broker lost the message
 
 
 async def test_requests_are_signed_with_the_key_of_the_rig(broker: Broker, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The state of a rig: what messages change, what they cannot do, and how much is remembered."""
+"""The state of a rig: effects of messages, faulty messages, and limited memory."""
 
 from __future__ import annotations
 

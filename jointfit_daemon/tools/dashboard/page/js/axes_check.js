@@ -87,11 +87,11 @@ function createCard(name) {
 /** Return the rotation between two orientations: its angle, the nearest sensor axis, and the angle between this axis and the axis of rotation, degrees. */
 export function turnSince(start, q) {
   const [w, ...v] = multiply(conjugate(start), q); // in the axes of the sensor
-  const length = Math.hypot(...v);
   const sign = w < 0 ? -1 : 1;
-  const angle = (2 * Math.atan2(length, Math.abs(w)) * 180) / Math.PI;
+  const angle = (2 * Math.atan2(Math.hypot(...v), Math.abs(w)) * 180) / Math.PI;
   const largest = v.reduce((best, value, i) => (Math.abs(value) > Math.abs(v[best]) ? i : best), 0);
-  const tilt = length === 0 ? 0 : (Math.acos(Math.min(1, Math.abs(v[largest]) / length)) * 180) / Math.PI;
+  const across = Math.hypot(...v.filter((_, i) => i !== largest));
+  const tilt = (Math.atan2(across, Math.abs(v[largest])) * 180) / Math.PI;
   return { angle, axis: `${sign * v[largest] < 0 ? "−" : "+"}${"xyz"[largest]}`, tilt };
 }
 

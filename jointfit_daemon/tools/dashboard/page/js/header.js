@@ -102,7 +102,7 @@ function emptyContent(link, store, configuration, rigs, choose, known) {
   if (link.state === "lost" && store.pose === null) {
     return { kind: "lost", children: [
       createElement("h2", {}, "Not connected"),
-      createElement("p", {}, "The page tries to connect every two seconds and continues by itself. Check the broker, and start the dashboard with the address of the broker:"),
+      createElement("p", {}, "The page tries to connect every 1.5 seconds and continues by itself. Check the broker, and start the dashboard with the address of the broker:"),
       createElement("pre", { tabindex: "0" }, createElement("code", {}, "systemctl status mosquitto\njointfit dashboard --broker mqtt://localhost:1883")),
     ] };
   }
