@@ -1,4 +1,4 @@
-"""Replacement of wrong keys in a ``[can.NAME]`` table, so that the check finds further faults."""
+"""Replacement of wrong keys in a ``[can.NAME]`` table, so that other checks find further faults."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def unusable_keys(table: Mapping[str, Any], in_use: Iterable[str]) -> dict[str, 
     """Return the faults of a bus by key; empty if at least one CAN driver accepts the bus.
 
     Only drivers know which interfaces can be opened. The drivers `in_use` check the bus first,
-    then all others until one accepts the bus. A driver after that one is not imported. If no
-    driver accepts the bus, the faults of the first driver are returned.
+    then the other drivers. The first driver that accepts the bus ends the search, so later drivers
+    are not imported. If no driver accepts the bus, the faults of the first driver are returned.
     """
     bus = readable_part({"channel": "can0", **table}, CanBusSettings, [])
     defaults = dict(CanBusSettings(channel="can0"))
@@ -63,9 +63,9 @@ def _refusal(model: Any, bus: CanBusSettings) -> dict[str, str]:
 
 
 def likely_interface(interface: str) -> str:
-    """Return the interface that replaces an unknown one.
+    """Return the interface that replaces an unknown interface.
 
-    The default `virtual` accepts all other keys.
+    If no known interface is similar, the result is `virtual`, which accepts all other keys.
     """
     return next(iter(get_close_matches(interface, ("socketcan", "slcan"), 1, _CLOSE)), "virtual")
 

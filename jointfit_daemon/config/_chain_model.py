@@ -50,7 +50,7 @@ def read_chain_model(given: str | dict[str, Any]) -> LoadedModel:
     Raises
     ------
     MalformedFileError
-        Damaged file or wrong content.
+        The file is damaged, or its content is wrong.
     OSError
         The file cannot be read.
     """
@@ -68,7 +68,7 @@ def content_of(model: LoadedModel) -> dict[str, Any]:
 def load_chain_model(
     given: str | dict[str, Any], table: ChainTable, mocap: MocapSettings | None
 ) -> tuple[LoadedModel | None, list[Fault]]:
-    """Return the chain model of the key `given`, and its faults.
+    """Return the chain model that `given` names or contains, and its faults.
 
     In `table` and `mocap`, keys that had faults are None. The remarks of the returned model list
     the rig's markers that the model does not contain.
@@ -93,7 +93,7 @@ def load_chain_model(
     faults += [
         Fault(
             f"mocap.markers.{segment}",
-            "missing; chain.model is tracked by single markers: name those of this segment "
+            "missing; chain.model is tracked by single markers: name the markers of this segment "
             "(a rigid body does not suffice)",
         )
         for segment in table.segments or ()

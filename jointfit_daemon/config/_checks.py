@@ -142,7 +142,7 @@ def check_chain(table: ChainTable) -> Iterator[Fault]:
 
 
 def _check_values_by_name(table: ChainTable) -> Iterator[Fault]:
-    """Check the lengths of segments and the angle conventions of joints."""
+    """Check the lengths of segments, the fixed origin, and the angle conventions of joints."""
     lengths: Any = table.lengths_m or {}
     for name, length in lengths.items():
         if table.segments:
@@ -241,7 +241,10 @@ def check_sensors(imus: Sequence[Mapping[str, Any]], table: ChainTable | None) -
 
 
 def body_parts_of(table: ChainTable) -> list[str]:
-    """Return the segments and the body parts with markers only. Keys that had faults are None."""
+    """Return the segments and the body parts that have markers only.
+
+    Keys of `table` that had faults are None.
+    """
     ends = [joint.child for joint in table.joint or ()]
     parts = [table.proximal, *(table.segments or ()), *ends, table.distal]
     return list(dict.fromkeys(part for part in parts if part))
@@ -435,7 +438,7 @@ def drifting_imus(sources: Sequence[Source]) -> frozenset[str]:
 
 
 def _on_gateway(sources: Sequence[Source]) -> dict[bool, list[str]]:
-    """Return the IMUs whose heading the gateway computes, by whether the heading drifts."""
+    """Return the IMUs whose heading the gateway computes, grouped by whether the heading drifts."""
     drifts: dict[bool, list[str]] = {True: [], False: []}
     for source in sources:
         if getattr(source.settings, "orientation", None) == "gateway":
@@ -452,10 +455,10 @@ def heading_warning(sources: Sequence[Source]) -> str | None:
     drifts = _on_gateway(sources)
     if not drifts[True] or not drifts[False]:
         return None
+    drifting = ", ".join(drifts[True])
     return (
-        f"heading by magnetometer on {', '.join(drifts[False])}, but not on "
-        f"{', '.join(drifts[True])}: the heading of the latter drifts, and joint rotation with it; "
-        "set the same `magnetometer` for all"
+        f"magnetometer used for {', '.join(drifts[False])}, but not for {drifting}: the heading of "
+        f"{drifting} drifts, and joint rotations drift with it; set the same `magnetometer` for all"
     )
 
 

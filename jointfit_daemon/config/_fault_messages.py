@@ -37,7 +37,7 @@ class Fault:
     """Description of a valid value, or of the fault if no valid value can be described."""
     value: Any = _NO_VALUE
     near: str | None = None
-    """Nearest valid name."""
+    """Valid name that is most similar to the wrong name; None without a similar name."""
 
     @property
     def has_value(self) -> bool:

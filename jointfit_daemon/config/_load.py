@@ -134,7 +134,7 @@ class _RigReader:
         self.imus_read: list[Source] = []
         """All IMUs whose tables are readable, even if the tables have faults."""
         self.imus_with_load: list[Source] = []
-        """IMUs of `imus_read` with known load. A faulty key counts with its smallest load."""
+        """IMUs of `imus_read` with known load. A faulty key has the value of the smallest load."""
         for key in table:
             if key not in SECTIONS:
                 known = f"unknown table; known: {', '.join(SECTIONS)}"
@@ -286,14 +286,14 @@ class _RigReader:
         return self._validate(key, self.table.get(key, {}), model)
 
     def _optional_section(self, key: str, model: type[Model]) -> Model | None:
-        """Return a table of rig.toml; None if it is absent."""
+        """Return a table of rig.toml; None if the table is absent or has faults."""
         return self._section(key, model) if key in self.table else None
 
     def _validate(self, key: str, table: object, model: type[Model]) -> Model | None:
         if not isinstance(table, dict):
             self.faults.append(Fault(key, "expected a table", table))
             return None
-        try:  # strict JSON mode: strings are not numbers, but arrays are tuples
+        try:  # strict JSON mode accepts no string as a number, but arrays as tuples
             return model.model_validate_json(json.dumps(table, default=str), strict=True)
         except ValidationError as error:
             self.faults += faults_of(error, model, key)
@@ -368,7 +368,7 @@ class _RigReader:
         return found
 
     def _imu_tables(self) -> list[dict[str, Any]]:
-        """Return the readable tables of sensors, and report the unreadable ones."""
+        """Return the readable tables of sensors, and report the unreadable tables."""
         found = self.table.get("imu", [])
         if not isinstance(found, list) or not all(isinstance(imu, dict) for imu in found):
             single = "; write [[imu]] in place of [imu]" if isinstance(found, dict) else ""

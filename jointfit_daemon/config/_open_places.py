@@ -1,6 +1,6 @@
 """Open places of a rig.toml: keys with the word ``later`` instead of a value.
 
-`jointfit init` writes the word where a device, its identifiers or its names were not known yet.
+`jointfit init` writes the word where a device, identifiers or names were not known yet.
 Invariant: an open place is reported as one fault with its remedy, and causes no other fault.
 """
 
@@ -43,7 +43,7 @@ _PLATE = (
 
 
 def fill_open_places(table: Mapping[str, Any]) -> tuple[dict[str, Any], list[Fault]]:
-    """Return a copy of a rig with valid values in its open places, and the fault of each place."""
+    """Return a copy of `table` with valid values in its open places, and a fault for each place."""
     filled, faults = dict(table), []
 
     imus = table.get("imu")

@@ -86,7 +86,7 @@ def _valid(value: Any, annotation: Any) -> Any:
     try:
         return _adapter(annotation).validate_json(json.dumps(value, default=str), strict=True)
     except ValidationError:
-        return None  # without a reported fault, because a validator raised for another key first
+        return None  # pydantic did not report this fault, because another key failed first
 
 
 @cache
@@ -112,7 +112,7 @@ def _elements(values: Sequence[Any], kind: Any, wrong: _Locations) -> tuple[Any,
 
 
 def contradictions(settings: BaseModel, key: str) -> Iterator[Fault]:
-    """Yield the contradictions between values of `settings`, and those of its inner tables.
+    """Yield the contradictions between values of `settings`, and between values of inner tables.
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _MOST_BYTES = 256 * 1024
-"""Largest file, bytes. A rig of four sensors has 3 kB, and parsing takes 0.5 s per MB."""
+"""Largest file, bytes. The file of a rig with four sensors has 3 kB; parsing takes 0.5 s per MB."""
 _MOST_ERRORS = 50
 """Largest number of syntax errors that are reported."""
 _MOST_REPEATED = 20

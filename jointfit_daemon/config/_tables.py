@@ -1,4 +1,4 @@
-"""Models of the tables of rig.toml, except those of drivers.
+"""Models of the tables of rig.toml, except the tables of drivers.
 
 Invariant: unknown keys are rejected, and the description of every field states its meaning and
 unit.
@@ -72,7 +72,9 @@ class ChainTable(Settings):
         description="instead of `joints`: the joints of a limb whose first segment carries a right "
         "and a left branch",
     )
-    side: Literal["right", "left"] = Field("right", description="side of the body: sign of angles")
+    side: Literal["right", "left"] = Field(
+        "right", description="side of the body; it determines the signs of the angles"
+    )
     proximal: str | None = Field(
         None, description="body part proximal of the first joint, with markers only (pelvis)"
     )
@@ -231,7 +233,7 @@ class CalibrationTable(Settings):
     refine_markers: bool = Field(
         True,
         description="whether the functional phase refines the positions of markers on body parts, "
-        "and those of the chain model",
+        "and of the markers of the chain model",
     )
     chain_refinement: ChainRefinementTable = Field(
         default_factory=ChainRefinementTable,

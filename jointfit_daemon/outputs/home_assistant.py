@@ -137,7 +137,10 @@ def _calibration(base: str) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def _problems(rig: Rig) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield a binary sensor of class ``problem`` for each device: disconnected, silent or stuck."""
+    """Yield a binary sensor of class ``problem`` for each device.
+
+    The sensor is on if the device is disconnected, silent or stuck.
+    """
     for source in rig.sources:
         device = f"value_json.devices[{json.dumps(source.id)}]"  # escaped as in Jinja templates
         yield (

@@ -11,8 +11,8 @@ class TokenBucket:
     rate_hz
         Permitted mean rate, 1/s.
     burst
-        Capacity of the bucket, which limits the number of tokens after a pause. It is full at the
-        start.
+        Capacity of the bucket, which limits the number of tokens after a pause. The bucket is
+        full at the start.
     now_s
         Current time of any monotonic clock, s.
     """

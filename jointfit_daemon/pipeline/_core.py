@@ -79,7 +79,7 @@ class Core:
     """Processes input events.
 
     The first event must be ``Configured``. Call ``feed`` with every event in the order of arrival.
-    If no event arrives before ``next_deadline_ns``, call it with a ``Tick`` at that time.
+    If no event arrives before ``next_deadline_ns``, call ``feed`` with a ``Tick`` at that time.
 
     Parameters
     ----------
@@ -227,7 +227,7 @@ class Core:
         return [*outputs, session.status(event.t_ns, text)]
 
     def _reload_sources(self, rig: Rig) -> None:
-        """Create states of new and changed sources. Unchanged sources keep their state."""
+        """Create the states of new and changed sources. Unchanged sources keep their state."""
         unchanged = {
             source.id: state
             for source in rig.sources

@@ -42,7 +42,7 @@ RATE_HZ = 5.0
 """Rate of examined frames, Hz. A search takes milliseconds, so it is distributed over several
 frames."""
 FAULT_NS = 2_000_000_000
-"""Time after which a fault begins or ends, ns."""
+"""Time for which a fault must be present or absent before its begin or end is reported, ns."""
 MISFIT_NS = 4_000_000_000
 """Time after which a cluster is reported if no exchange of labels explains its misfit, ns."""
 _FEWEST = 7
@@ -94,7 +94,8 @@ class LabelMonitor:
         self._hidden: NDArray[np.intp] = np.zeros(0, dtype=np.intp)
         """Columns of the mocap layout whose labels are faulty."""
         self.faults: dict[LabelFault, frozenset[str]] = {}
-        """Body parts whose markers must be visible before the fault can end, by current fault."""
+        """Current faults, each with the body parts whose markers must be visible before it can end.
+        """
         self.misfits: frozenset[str] = frozenset()
         """Body parts whose markers do not fit for a reason that no fault in `faults` explains."""
 
@@ -258,7 +259,8 @@ def _misfit_notice(t_ns: int, part: str, rms: float) -> Notice:
     text = (
         f"{part}: its markers do not match the static pose: {1000 * rms:.0f} mm RMS, at most "
         f"{1000 * MAX_FIT_RMS_M:g} mm expected, and no single exchange of labels explains it. "
-        "Check labels and places, or repeat the calibration. Until then, cameras give no pose of it"
+        "Check labels and places, or repeat the calibration. Until then, the cameras give no pose "
+        "of this part"
     )
     data = {"state": MarkerFlag.MISFIT.value, "rms_m": round(rms, 4)}
     return Notice(t_ns, NoticeKind.MARKER, part, text, NoticeLevel.WARNING, data)

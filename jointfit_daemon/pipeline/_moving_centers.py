@@ -39,8 +39,8 @@ _SAME_DIRECTION = 0.3
 """Largest singular value of a direction that counts as observed by both centers.
 
 The singular values are those of a matrix. Its rows are the directions that the running center did
-not observe, and those that the calibrated center did not observe. If a row of one center nearly
-equals a row of the other, the two rows have one large and one small singular value."""
+not observe, and the directions that the calibrated center did not observe. If a row of one center
+nearly equals a row of the other, the two rows have one large and one small singular value."""
 
 
 class MovingCenters:
@@ -126,7 +126,7 @@ class MovingCenters:
     def _add_positions(
         centers: LiveJointCenters, found: RunningCenter, fit: CenterEstimate | None
     ) -> RunningCenter:
-        """Add the joint's position, which follows from the markers in the newest frame."""
+        """Add the joint's position, computed from the markers in the newest frame."""
         parts = centers.parts
         number = parts.names.index(found.segment)
         if fit is None or found.center is None or not parts.placed[number]:

@@ -1,8 +1,8 @@
 """Rate limit for notices about wires and clocks: one per minute, device and kind.
 
 A condition is reported when it begins. While it lasts, its totals are reported once a minute. If it
-lasted for more than one report, its end is reported after a minute without the condition. Lost
-samples are a warning if they exceed the share `MOST_LOST` of the samples in a minute.
+lasted for more than one report, its end is reported after a minute without the condition. The
+notice is a warning if the lost samples exceed the share `MOST_LOST` of the samples in a minute.
 
 Invariant: the sum of the totals in all notices equals the total number of events.
 """
@@ -27,7 +27,7 @@ STEP_NS = 2_000_000
 """Smallest step of UNIX time that is reported, ns. The corrections by NTP are smaller."""
 
 _LEVELS = {"warning": NoticeLevel.WARNING, "error": NoticeLevel.ERROR}
-"""Level of the notice for kinds of device events that are not ``info``."""
+"""Level of the notice by kind of device event. All other kinds have the level ``info``."""
 _JUMPS = {"restart": NoticeKind.CLOCK, "clock": NoticeKind.CLOCK, "counter": NoticeKind.WIRE}
 """Kind of the notice for device events that are summarized by their last text and their number."""
 _NO_DATA: Mapping[str, object] = MappingProxyType({})
@@ -138,7 +138,7 @@ def _totals(kind: str, condition: _Condition) -> dict[str, object]:
 
 
 def unix_step_notices(now_ns: int, step_ns: int) -> list[Notice]:
-    """Return a notice that UNIX time of this host was changed by `step_ns`; none if it is small."""
+    """Return a notice that UNIX time of this host changed by `step_ns`; none for a small step."""
     if abs(step_ns) < STEP_NS:
         return []
     step_s = step_ns / 1e9

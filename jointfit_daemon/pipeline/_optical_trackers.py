@@ -21,8 +21,8 @@ def chain_tracker(
 ) -> ChainTracker | None:
     """Return a tracker of the chain model; None if rig.toml requests none.
 
-    The markers are refined if the calibration contains refined markers of this model. The tracker
-    `before` is returned if it is equivalent.
+    The tracker uses refined markers if the calibration contains refined markers of this model. The
+    tracker `before` is returned if it is equivalent.
     """
     if rig.chain_model is None or rig.mqtt.chain_hz <= 0.0:
         return None

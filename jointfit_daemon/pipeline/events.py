@@ -55,8 +55,8 @@ class SourceOpened:
 class SourceClosed:
     """A driver ended because the device is lost, misconfigured, or removed by a reload.
 
-    The driver of a lost device is started again soon, and that of a misconfigured device after a
-    pause. A removed device is not started again.
+    The driver of a lost device is started again soon, and the driver of a misconfigured device
+    after a pause. The driver of a removed device is not started again.
     """
 
     t_ns: int
@@ -75,7 +75,7 @@ class ChunkArrived:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """No other event arrived before a deadline of the core, or within the longest interval."""
+    """No other event arrived before a deadline of the core, or within 100 ms."""
 
     t_ns: int
 
@@ -276,7 +276,7 @@ class CalibrationStatus:
     version: int | None = None
     """Version of the current calibration; None if there is none, or if it is not stored."""
     quality: Mapping[str, object] = field(default_factory=dict)
-    """Quality of the result of the last phase; without a result, of the current calibration."""
+    """Quality of the last phase's result, or of the current calibration if there is no result."""
     kept: str | None = None
     """Reason why a new result was rejected, so that the current calibration stays in use."""
     refused: Mapping[str, object] = field(default_factory=dict)

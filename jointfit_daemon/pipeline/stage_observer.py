@@ -9,7 +9,7 @@ from typing import Protocol
 
 
 class StageObserver(Protocol):
-    """Observer of the processing stages of a frame. It may use a clock, which a core must not."""
+    """Observer of the processing stages of a frame. It may use a clock; a core must not."""
 
     def mark_decoded(self, arrival_ns: int) -> None:
         """Record that a chunk was decoded and its measurements were stamped.

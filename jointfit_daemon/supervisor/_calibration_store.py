@@ -176,7 +176,7 @@ class CalibrationWriter:
             if newest:
                 self._unwritten = self.fault = None
 
-        # The number is not the version of the current calibration if a newer calibration is in
+        # `version` is not the version of the current calibration if a newer calibration is in
         # use, or if a reload selected another store.
         if newest and rig.calibration_store == self._store:
             self._deliver(CalibrationStored(time.monotonic_ns(), version, dated.created_utc))
@@ -187,7 +187,7 @@ class CalibrationWriter:
             await asyncio.wait(set(self._writing))
 
     def load(self, rig: Rig) -> LoadedCalibration:
-        """Return the calibration to use: the newest in the store, or a newer unwritten one."""
+        """Return the calibration to use: the newest stored or a newer unwritten calibration."""
         self._store = rig.calibration_store
         if self._unwritten is not None:
             asked, calibration, _ = self._unwritten

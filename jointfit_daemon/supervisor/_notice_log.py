@@ -55,7 +55,7 @@ class NoticeLog:
         self.online: set[str] = set()
 
     def configure(self, rig: Rig) -> None:
-        """Use another rig. Sources that it does not contain no longer count as online."""
+        """Use another rig. Sources that `rig` does not contain no longer count as online."""
         self._rig = rig
         self.online &= {source.id for source in rig.sources}
 
@@ -76,7 +76,10 @@ class NoticeLog:
                 (self.online.add if online else self.online.discard)(name)
 
     def write_due(self, now_s: float, *, stalled: bool) -> None:
-        """Write the delayed lines that are due at `now_s`. `stalled` delays them further."""
+        """Write the delayed lines that are due at `now_s`.
+
+        `stalled` states that the event loop was delayed. The lines are then delayed further.
+        """
         if stalled:
             self._outages.postpone(now_s)
         for notice in self._outages.due(now_s):

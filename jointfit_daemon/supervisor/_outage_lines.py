@@ -6,8 +6,8 @@ delayed until the source can no longer be closed because of this silence. If the
 data, it is not closed, and the line is written. A stall of the host has its own line. After a
 stall, the lines are delayed until the sensors may have recovered.
 
-Invariant: if its source stays open, the line about a lost sensor is written within `LONGEST_S`,
-even if the host stalls continuously.
+Invariant: the line about a lost sensor whose source stays open is written within `LONGEST_S`, even
+if the host stalls continuously.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from math import inf
 from jointfit_daemon.pipeline.events import Notice, NoticeKind
 
 RECOVERY_S = 4.0
-"""Time after a stall of the event loop within which sensors recover, s. It consists of 2 s without
-a fault, and 2 s to process the delayed data."""
+"""Time after a stall of the event loop within which sensors recover, s: 2 s to process the delayed
+data, and 2 s without a fault."""
 LONGEST_S = 30.0
 """Longest time for which stalls may delay a line, s."""
 

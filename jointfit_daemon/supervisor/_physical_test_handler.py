@@ -27,7 +27,7 @@ ABANDONED_S = 30.0
 LONGEST_S = 300.0
 """Longest duration of a test, s. The limit also ends a test whose web page remains open."""
 OPEN_S = 20.0
-"""Longest time from opening to the first orientation, s, including a search for the speed."""
+"""Longest time from opening to the first orientation, s, including the search for the baud rate."""
 RUNNING_PHASES = ("align", "static", "functional", "fitting")
 """Calibration phases that the restart of a device would invalidate."""
 
@@ -115,7 +115,7 @@ def _state(
 
 
 class PhysicalTestHandler:
-    """Executes the request. At most one test runs at a time.
+    """Executes the request `physical-test`. At most one test runs at a time.
 
     Parameters
     ----------

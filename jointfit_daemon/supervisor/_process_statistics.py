@@ -21,7 +21,7 @@ _DELAYS = 600
 
 
 class ProcessStatistics:
-    """Statistics of this process, some of them since the previous call of `health`."""
+    """Measures CPU share, memory and event loop delay."""
 
     def __init__(self) -> None:
         self._wall_s, self._cpu_s = time.monotonic(), time.process_time()

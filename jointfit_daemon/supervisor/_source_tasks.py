@@ -172,7 +172,7 @@ async def run_source(
 
 
 async def _wait_for_retry(path: str | None, delay_s: float) -> None:
-    """Wait for `delay_s`. If no device exists at `path`, wait only until one appears."""
+    """Wait for `delay_s`. If no device exists at `path`, end the wait when a device appears."""
     absent = path is not None and _device_identity(path) is None
     loop = asyncio.get_running_loop()
     until_s = loop.time() + delay_s

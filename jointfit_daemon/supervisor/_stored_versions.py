@@ -1,7 +1,7 @@
 """Summaries of the stored calibrations for the request ``calibrations``.
 
-A summary reads the file without the checks that are necessary before a calibration is used. A list
-therefore costs only milliseconds.
+The file is read without the checks that are necessary before a calibration is used. A list of
+summaries therefore takes only milliseconds.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ class VersionSummary:
     online: dict[str, Any] | None = None
     """Last refit of this version's models by online learning; None without a refit. The keys are
     the number of refits since the functional phase, the previous version, and the errors before and
-    after."""
+    after the refit."""
     functional: bool | None = None
     """Whether the calibration includes a functional phase with the cameras; None if unknown."""
     usable: bool = False
     """Whether the calibration fits the limb and the sensors of the rig."""
     segments_deg: dict[str, float | None] = field(default_factory=dict)
-    """RMS orientation error of each segment on held-out movement, by the method in use."""
+    """RMS orientation error of each segment on held-out movement, with the method in use, deg."""
     flexion_deg: dict[str, float | None] = field(default_factory=dict)
-    """RMS flexion error of each joint on held-out movement, by the method in use."""
+    """RMS flexion error of each joint on held-out movement, with the method in use, deg."""
     fault: str | None = None
     """Reason why the file cannot be read; None if it can."""
 

@@ -235,7 +235,7 @@ class Daemon:
         tasks.create_task(self._reload_on_request(), name="reload")
         await self._sources.apply(self._rig.sources)
 
-        gc.freeze()  # permanent objects are excluded, because scanning them takes milliseconds
+        gc.freeze()  # permanent objects are not scanned, because a scan takes milliseconds
         log.info("%s: running, %s", self._rig.name, _count_text(self._rig.sources))
         tasks.create_task(self._notify_when_ready(), name="ready")
 
@@ -247,7 +247,7 @@ class Daemon:
     async def _check_state(self, *, asked: bool = True) -> None:
         """Report a state directory without write access, before a calibration must be stored.
 
-        If `asked`, the cause of the check is the start, a request or a reload. Otherwise only
+        `asked` states that the start, a request or a reload caused the check. Otherwise, only
         changes are reported.
         """
         folder = store_directory(self._rig)

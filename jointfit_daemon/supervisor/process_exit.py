@@ -40,7 +40,7 @@ class ExitLimit:
     def start(self) -> None:
         """Start the time limit.
 
-        It is safe in a signal handler, and a repeated call has no effect.
+        A signal handler may call this method. A repeated call has no effect.
         """
         self._started.put(True)
 

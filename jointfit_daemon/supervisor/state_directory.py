@@ -20,7 +20,7 @@ LOCK = "lock"
 PRIVATE_UMASK = 0o077
 """Umask of the daemon, because calibrations and recordings are personal data."""
 _DIRECTORY_MODE, _FILE_MODE = 0o700, 0o600
-_OWNED = ("calibrations", "recordings")
+_OWNED = ("calibrations", "recordings", "spool")
 """Folders that the daemon writes. Other folders in the state directory may belong to other
 programs."""
 WRITE_REMEDY = "check mount, permissions and free space, or set STATE_DIRECTORY"
@@ -43,8 +43,8 @@ def lock_state(directory: Path) -> int | None:
     """Lock `directory` for this process, and return the descriptor that owns the lock.
 
     Return None if no lock file can be created, because a directory without write access contains no
-    state to protect. Some network file systems have no locks. On these, the descriptor of the file
-    is returned without a lock.
+    state to protect. On network file systems without locks, the descriptor of the file is
+    returned without a lock.
 
     Raises
     ------

@@ -44,7 +44,7 @@ def main() -> int:
     threading.Thread(target=_exit_with_parent, daemon=True).start()
 
     try:
-        from jointfit_daemon.calibration.phases import run_job  # noqa: PLC0415 - its fault is an answer
+        from jointfit_daemon.calibration.phases import run_job  # noqa: PLC0415 - errors are answers
 
         job = pickle.loads(data)  # noqa: S301 - written by our parent
         answer: dict[str, object] = {"result": run_job(job, _control(answer_fd)).to_dict()}

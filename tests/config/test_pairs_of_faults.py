@@ -137,12 +137,12 @@ MISTAKES = (
 """Text of the rig, its replacement, and a part of the expected message."""
 
 ALL = "JOINTFIT_ALL_PAIRS" in os.environ
-"""Whether to try all pairs, which takes 4 s, and not every third one."""
+"""Whether to try all pairs, which takes 4 s, instead of every third pair."""
 
 
 @pytest.fixture(autouse=True)
 def installed_drivers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Read the metadata of all packages once, and not at every search for a driver, 20 ms each."""
+    """Read the metadata of all packages once instead of at every driver search (20 ms each)."""
     monkeypatch.setattr("jointfit_daemon.driver.entry_points", cache(entry_points))
 
 
@@ -170,7 +170,7 @@ def test_every_mistake_is_reported_alone(tmp_path: Path, subtests: pytest.Subtes
 
 
 UNREADABLE_SEGMENTS = "unclosed array"
-"""Without the segments their number and the names of segments cannot be checked."""
+"""If the list of segments is unreadable, the texts in `NEED_SEGMENTS` cannot be reported."""
 NEED_SEGMENTS = (
     "chain.proximal = 'shank'", "chain.lengths_m.thihg", "imu[S3].segment = 'shnak'",
     "expected 3 joints", "calibration.joint_center_methods.kene", "mocap.rigid_body.foot",

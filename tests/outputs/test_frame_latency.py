@@ -28,7 +28,7 @@ STEP_NS = 100
 
 
 class Clock:
-    """A clock that shows what it was set to, and advances by `step_ns` with each reading."""
+    """A clock that the test sets, and that advances by `step_ns` with each reading."""
 
     def __init__(self, step_ns: int = 0) -> None:
         self.now_ns, self._step_ns = 0, step_ns

@@ -1,4 +1,4 @@
-"""The discovery message follows the rules of Home Assistant, whose templates read our payloads.
+"""The discovery message follows the rules of Home Assistant, and its templates read the payloads.
 
 The rules are from its documentation ("MQTT discovery", "MQTT sensor", "MQTT binary sensor", "MQTT
 button"). Here, they are a JSON Schema.

@@ -1,4 +1,4 @@
-"""Steps of UNIX time in operation: followed, passed to the core, frames stay in order."""
+"""Steps of UNIX time during operation: the clock follows, and the frames remain in order."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ BEGIN_UNIX_NS = 1_795_250_000 * S
 
 
 class SuspendedHost:
-    """Both clocks of a host: monotonic time goes on by itself, UNIX time can be set."""
+    """Both clocks of a host. Monotonic time advances by itself, and UNIX time can be set."""
 
     def __init__(self) -> None:
         self.now_ns, self.offset_ns = 5_000 * S, BEGIN_UNIX_NS - 5_000 * S
@@ -115,7 +115,7 @@ async def test_mono_us_is_monotonic_across_a_step_of_unix_time(
 
 
 class Listening:
-    """A core that only hears."""
+    """A core that stores its input and returns nothing."""
 
     def __init__(self) -> None:
         self.heard: list[Event] = []
@@ -136,17 +136,17 @@ class Listening:
 async def test_core_receives_the_unix_offset_first_and_after_each_step(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Through the real heart; the host's clock is set a second after the start."""
+    """The core runs in the real core runner; the host's clock is set 0.3 s after the start."""
     set_ns = 0
     true_unix_ns = time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: true_unix_ns() + set_ns)
     core = Listening()
-    beating = asyncio.create_task(CoreRunner(core, UnixClock()).run(), name="heart")
+    running = asyncio.create_task(CoreRunner(core, UnixClock()).run(), name="core runner")
     await asyncio.sleep(0.3)
     set_ns = -3_600 * S
     await asyncio.sleep(1.5)
-    beating.cancel()
-    await asyncio.wait([beating])
+    running.cancel()
+    await asyncio.wait([running])
     assert isinstance(core.heard[0], UnixOffset)
     told = [event.offset_ns for event in core.heard if isinstance(event, UnixOffset)]
     assert len(told) == 2

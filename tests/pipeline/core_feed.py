@@ -69,7 +69,7 @@ def table(**head: Any) -> dict[str, Any]:
 
 
 def orientation(name: str, number: int) -> tuple[float, float, float, float]:
-    """Return where a sensor points: each turns by 60 deg/s at most, about its own axis."""
+    """Return the orientation of a sensor, which rotates about its own axis by at most 60 deg/s."""
     half = 0.5 * math.sin(0.02 * number + len(name) + ord(name[-1]))
     axis = [0.0, 0.0, 0.0]
     axis[ord(name[-1]) % 3] = math.sin(half)
@@ -105,13 +105,13 @@ def xcdi_bytes(name: str, number: int, t_ns: int) -> bytes:
 
 
 def camera_bytes(number: int) -> bytes:
-    """Return camera frame `number`, without anything in it."""
+    """Return camera frame `number`, without markers and bodies."""
     ticks = number * 100_000
     return encode_natnet(FrameOfData(number, 0.0, ticks, ticks + 1, ticks + 2), _VERSION)
 
 
 def camera_hello(t_ns: int) -> list[Event]:
-    """Return the first packet of a mocap server."""
+    """Return the first packets of a mocap server: its description and its model."""
     info = ServerInfo("Motive", (2, 1, 0, 0), (3, 0, 0, 0), 10_000_000)
     bodies = tuple(
         BodyDescription(name, number, -1, _NOWHERE, (), (), ())
@@ -139,34 +139,34 @@ def opening(*, mocap: bool = True) -> list[Event]:
 
 
 def arrival_ns(event: Event) -> int:
-    """Return when an event happens."""
+    """Return the host time of an event, ns."""
     return event.chunk.t_ns if isinstance(event, ChunkArrived) else event.t_ns
 
 
 @dataclass
 class Bench:
-    """A core with a perfect shell: it hears its deadlines on the nanosecond."""
+    """A core that receives all events in time, and a tick exactly at each deadline."""
 
     core: Core = field(default_factory=Core)
     fed: list[Event] = field(default_factory=list)
     out: list[Output] = field(default_factory=list)
     states: list[LimbState] = field(default_factory=list)
     said_ns: dict[int, int] = field(default_factory=dict)
-    """When each frame came out, by the instant it is true for."""
+    """Time of the output of each frame, by the time of the frame, ns."""
 
     def feed(self, events: Iterable[Event]) -> None:
-        """Feed events in order, and Ticks between them as the core asks for."""
+        """Feed events in order, and between them the ticks that the core requests."""
         for event in events:
             self.wait_until(arrival_ns(event))
             self.give(event, arrival_ns(event))
 
     def wait_until(self, t_ns: int) -> None:
-        """Let time go on to `t_ns`."""
+        """Feed the ticks that are due before `t_ns`."""
         while (due_ns := self.core.next_deadline_ns) is not None and due_ns < t_ns:
             self.give(Tick(due_ns), due_ns)
 
     def give(self, event: Event, now_ns: int) -> None:
-        """Feed one event at `now_ns`, without the Ticks that were due before it."""
+        """Feed one event at `now_ns`, without the ticks that were due before it."""
         self.fed.append(event)
         for output in self.core.feed(event):
             self.out.append(output)

@@ -35,7 +35,7 @@ COUNT = 40
 SOURCES = (*SENSORS, "mocap")
 PATIENCE = 1.5
 HOST_STAMP_BYTES = 8
-"""A record begins with the host's own stamp, which no wire can spoil."""
+"""Size of the host's stamp at the start of a record. Faults of the wire cannot change it."""
 SETTLED = 60
 """Samples after which the simulated clocks and delays have settled."""
 
@@ -44,7 +44,9 @@ FATES = ("well", "well", "well", "lost", "late", "spoiled", "torn", "two")
 
 
 def troubled(dice: random.Random) -> list[Event]:
-    """Samples of all sources, some never sent, late, torn, spoiled or sent twice; a reconnect."""
+    """Return the events of all sources, with lost, late, damaged, truncated and repeated samples
+    and a reconnect.
+    """
     events: list[Event] = []
     for name in SOURCES:
         for number in range(COUNT):
@@ -113,7 +115,7 @@ def test_no_sample_is_pending_after_all_sources_closed() -> None:
 
 @cache
 def waited(missing: frozenset[tuple[str, int]], count: int = SETTLED + 30) -> dict[int, int]:
-    """Return when each frame came out while some samples never came."""
+    """Return the output time of each frame, by its time, ns, if some samples are missing."""
     bench = Bench()
     samples = [chunk(s, n) for s in SENSORS for n in range(count) if (s, n) not in missing]
     bench.feed(opening(mocap=False))
@@ -140,7 +142,7 @@ def test_missing_samples_delay_a_frame_by_one_and_a_half_periods_at_most(
 
 
 def test_missing_sample_delays_its_frame() -> None:
-    """The bound is not met by never waiting."""
+    """The aligner waits for missing samples; otherwise the other test would be meaningless."""
     whole, holed = waited(frozenset()), waited(frozenset({("S4", SETTLED + 5)}))
     delays = [holed[t_ns] - whole[t_ns] for t_ns in whole if t_ns in holed]
     assert max(delays) > 0.5 * PERIOD_NS

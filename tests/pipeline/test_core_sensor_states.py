@@ -56,7 +56,7 @@ def calibration() -> Calibration:
 
 @cache
 def outputs(sensors_hz: float, *, calibrated: bool = True) -> tuple[LimbState | SensorStates, ...]:
-    """Return what the core makes of the bytes of all sensors; some samples are missing."""
+    """Return the outputs of the core for the bytes of all sensors; some samples are missing."""
     dice = random.Random(7)
     rig = parse_rig(table() | {"mqtt": {"sensors_hz": sensors_hz}})
     used = calibration() if calibrated else None

@@ -95,7 +95,7 @@ class Sent:
 
 
 class TimeFaultCore(Core):
-    """Core that provides its frames, because uncalibrated states name no sensor."""
+    """Core that stores its frames, because uncalibrated states do not name the sensors."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -119,7 +119,7 @@ class Lived:
     fault_ns: int
 
     def between(self, begin_ns: int, end_ns: int) -> list[tuple[str, AlignedFrame]]:
-        """Return sync states and frames that were output in this time after the fault."""
+        """Return sync states and frames that were output in this interval after the fault."""
         return [
             (state.sync, frame)
             for state, frame in zip(self.states, self.frames, strict=True)
@@ -127,7 +127,7 @@ class Lived:
         ]
 
     def sync_with(self, name: str, begin_ns: int, end_ns: int) -> set[str]:
-        """Return the sync states of the frames with that sensor."""
+        """Return the sync states of the frames in this interval that contain the sensor."""
         return {
             sync for sync, frame in self.between(begin_ns, end_ns) if name in frame.orientations
         }

@@ -101,7 +101,7 @@ class UnixTimeRig:
         self.bench.feed([ChunkArrived("mocap", Chunk(BEGIN_NS, word)) for word in words])
 
     def stream(self, seconds: float) -> None:
-        """Let everything stream."""
+        """Feed the data of all sources for this duration, s."""
         self.bench.feed(self._events(round(seconds * S / PERIOD_NS)))
 
     def _events(self, count: int) -> Iterator[Event]:
@@ -111,7 +111,7 @@ class UnixTimeRig:
         self.number += count
 
     def set_unix_time(self, offset_ns: int) -> None:
-        """Let the shell find that UNIX time is another."""
+        """Report another offset of UNIX time to the core."""
         self.bench.feed([UnixOffset(BEGIN_NS + self.number * PERIOD_NS, offset_ns)])
 
     def state(self) -> str:

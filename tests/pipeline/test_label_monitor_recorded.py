@@ -1,4 +1,4 @@
-"""Marker labels of a recorded person: exchanges are named, and none is invented."""
+"""Marker labels of a recorded person: exchanges are named, and correct labels give no notice."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_exchanges_within_a_segment_of_a_recorded_person_are_named(folder: Path,
         exchanged = positions.copy()
         exchanged[:, rows] = positions[:, rows[::-1]]
         found = notices(LabelMonitor(CHAIN, stored), exchanged)
-        # a marker of the thigh is hidden for seconds while walking: the other one comes first then
+        # While one marker of a pair is hidden, the other marker of the pair is named first.
         named = [one.data.get("markers") for one in found]
         if named not in ([list(pair)], [list(pair[::-1])]):
             missed.append((pair, [one.text for one in found]))

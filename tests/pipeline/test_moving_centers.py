@@ -1,4 +1,4 @@
-"""Running joint centers against simulated limbs whose joints move, or do not."""
+"""Running joint centers of simulated limbs, with and without a displacement of a joint."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A daemon in this process, its answers to requests, and what a request could change."""
+"""A daemon in this process, its answers to requests, and the state that a request can change."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _toml(value: Any) -> str:
 
 
 class Running:
-    """A daemon in this process without a broker, and what it publishes."""
+    """A daemon in this process without a broker, with its replies and notices."""
 
     def __init__(self, folder: Path, rig: dict[str, Any]) -> None:
         self.folder, self.table = folder, rig
@@ -104,7 +104,7 @@ class Running:
         return self.replies[count]
 
     def state(self) -> tuple[object, ...]:
-        """Return what a request could change."""
+        """Return the state that a request can change."""
         core = cast("Any", self.daemon._core.core)
         stored = _calibration_store.store_of(self.daemon.rig).versions()
         session = core._session

@@ -102,7 +102,7 @@ def small(table: dict[str, Any], port: int, **moods: str) -> dict[str, Any]:
 
 
 def toml(table: dict[str, Any]) -> str:
-    """Return `table`, which has tables of plain values and one list of tables, as TOML."""
+    """Return the TOML text of `table`, which contains tables of values and one list of tables."""
     lines = []
     for name, part in table.items():
         for section in part if isinstance(part, list) else [part]:
@@ -438,11 +438,11 @@ async def test_a_receiver_of_lsl_gets_the_frames_of_the_daemon(
 # --- parts --------------------------------------------------------------------------------------
 
 
-async def test_a_deadline_that_stays_past_does_not_spin() -> None:
+async def test_a_deadline_in_the_past_causes_a_limited_number_of_ticks() -> None:
     core = RecordingCore()
     core.next_deadline_ns = 0
-    heart = CoreRunner(core, UnixClock())
-    running = asyncio.create_task(heart.run(), name="heart")
+    runner = CoreRunner(core, UnixClock())
+    running = asyncio.create_task(runner.run(), name="core runner")
     await asyncio.sleep(0.1)
     running.cancel()
     await asyncio.wait([running])
@@ -451,9 +451,9 @@ async def test_a_deadline_that_stays_past_does_not_spin() -> None:
 
 async def test_core_receives_a_tick_at_its_deadline() -> None:
     core = RecordingCore()
-    heart = CoreRunner(core, UnixClock())
+    runner = CoreRunner(core, UnixClock())
     core.next_deadline_ns = time.monotonic_ns() + LONGEST_TICK_INTERVAL_NS // 2
-    running = asyncio.create_task(heart.run(), name="heart")
+    running = asyncio.create_task(runner.run(), name="core runner")
     await until(lambda: any(isinstance(event, Tick) for event in core.events))
     tick = next(event for event in core.events if isinstance(event, Tick))
     late_ns = tick.t_ns - core.next_deadline_ns

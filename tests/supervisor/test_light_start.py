@@ -1,4 +1,4 @@
-"""Imports and threads of a start and of a fit."""
+"""Imported modules and number of threads of the daemon, of commands and of a fit."""
 
 from __future__ import annotations
 

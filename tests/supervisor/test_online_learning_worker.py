@@ -42,7 +42,7 @@ def orientation(name: str, number: int) -> tuple[float, ...]:
 
 
 def camera_bytes(number: int) -> bytes:
-    """Return a frame of two rigid bodies that are turned as the bones."""
+    """Return a frame of two rigid bodies with the orientations of the bones."""
     bodies = []
     for label, q in enumerate(BENDING.reference.values(), 1):
         w, x, y, z = q[number].tolist()
@@ -82,7 +82,7 @@ def soon(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 async def answered(bench: Bench, job: FitJob) -> None:
-    """Have the worker do the job, and feed what it says as if it had taken no time."""
+    """Run the job in the worker, and feed its result at the time of the last event."""
     said: list[Event] = []
     async with asyncio.TaskGroup() as tasks:
         FitRunner(tasks, said.append).start(job)
@@ -115,7 +115,7 @@ async def test_online_learning_improves_the_calibration_and_replays_identically(
     assert error(bench.states[-MORE // 2 :]) < 0.6 * error(before)
     around = [state.segments[0].q_world_segment for state in bench.states[told - 20 : told + 20]]
     steps = [rotation.angle_between(np.array(a), np.array(b)) for a, b in pairwise(around)]
-    assert max(steps[19:21]) < 1.5 * max(steps[:19])  # no jump where models were exchanged
+    assert max(steps[19:21]) < 1.5 * max(steps[:19])  # no jump at the change of the models
     logged = after_recording(bench.fed)
     assert replay_states(logged) == bench.states
 

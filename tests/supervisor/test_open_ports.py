@@ -26,12 +26,12 @@ pytestmark = pytest.mark.system
 
 
 def inodes_of(process: int) -> set[str]:
-    """Return the sockets that a process holds."""
+    """Return the inodes of the sockets that a process has open."""
     found = set()
     for link in Path(f"/proc/{process}/fd").iterdir():
         try:
             target = str(link.readlink())
-        except FileNotFoundError:  # closed meanwhile, like that of this very listing
+        except FileNotFoundError:  # closed meanwhile, like the descriptor of this listing
             continue
         if target.startswith("socket:["):
             found.add(target[8:-1])
@@ -51,7 +51,7 @@ def listening(process: int) -> list[str]:
 
 
 def test_a_listening_socket_is_found() -> None:
-    before = listening(os.getpid())  # other tests of this process may serve, too
+    before = listening(os.getpid())  # other tests of this process may also listen
     with socket.create_server(("127.0.0.1", 0)):
         assert sorted(listening(os.getpid())) == sorted([*before, "0100007F"])
 

@@ -16,7 +16,7 @@ def test_lost_sensor_has_no_line_beside_that_of_its_closed_source() -> None:
     lines.close("S1")
     assert lines.due(100.0) == []
     assert not lines.holds(sensor("ok"), 20.0, 2.0)
-    assert lines.holds(sensor("lost"), 30.0, None), "the source was closed first"
+    assert lines.holds(sensor("lost"), 30.0, None), "the closed source already has a line"
     assert lines.due(1000.0) == []
 
 
@@ -50,7 +50,7 @@ def test_sensors_lost_in_a_stall_of_the_host_have_a_line_only_if_they_stay_lost(
     assert lines.holds(sensor("ok"), 13.0, 2.0)
 
     lines.postpone(20.0)
-    assert lines.holds(sensor("lost"), 20.1, 2.0), "reported after the stall was noticed"
+    assert lines.holds(sensor("lost"), 20.1, 2.0), "a loss soon after a stall is postponed"
     assert lines.due(23.9) == []
     assert [notice.text for notice in lines.due(24.0)] == ["lost"]
 

@@ -1,4 +1,4 @@
-"""The overload warnings: their limits, their figures and their rate; one for one cause."""
+"""Overload warnings: limits, figures and rate, and one warning for each cause."""
 
 from __future__ import annotations
 

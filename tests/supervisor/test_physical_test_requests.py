@@ -1,4 +1,4 @@
-"""The request `physical-test`: one test at a time, judged as by `jointfit probe`."""
+"""The request `physical-test`: one test at a time, with the result of `jointfit probe`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ async def test_a_complete_test_is_judged_and_its_answer_fits_the_model() -> None
     running = RunningPhysicalTest(turned_source("world_to_sensor"))
     assert (await running.state())["state"] == "opening"
     for chunk in guided_chunks():
-        running.event(ChunkArrived("S2", chunk))  # of another sensor
+        running.event(ChunkArrived("S2", chunk))  # chunks of another sensor
     assert (await running.state())["state"] == "opening"
     for chunk in guided_chunks():
         running.event(ChunkArrived("S1", chunk))
@@ -36,7 +36,7 @@ async def test_a_complete_test_is_judged_and_its_answer_fits_the_model() -> None
     ANSWERS["physical-test"].model_validate(answer)
     assert (answer["state"], answer["step"]) == ("finished", 4)
     assert answer["result"]["rig_toml"] == ('direction = "sensor_to_world"',)
-    running.event(SourceClosed(0, "S1", "lost", "unplugged"))  # too late to matter
+    running.event(SourceClosed(0, "S1", "lost", "unplugged"))  # after the end of the test
     assert (await running.state())["state"] == "finished"
 
 

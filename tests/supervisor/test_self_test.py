@@ -1,4 +1,4 @@
-"""The self-test on the lag behind the cameras: a fault only if a phase could have estimated it."""
+"""The self-test of the lag: an unknown lag is a fault only if a phase could have estimated it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Any sequence of device faults, restarts and reloads leaves sources that stream again."""
+"""After any sequence of device faults, restarts and reloads, the sources stream again."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ MOODS = ("well", "well", "silent", "lost", "absent", "wrong", "ends")
 
 
 class SimulatedTimeLoop(asyncio.SelectorEventLoop):
-    """A loop whose time passes at once when all tasks wait for it."""
+    """An event loop whose time advances at once when all tasks wait."""
 
     def __init__(self) -> None:
         super().__init__(_NeverWaiting(self))
@@ -45,7 +45,7 @@ class SimulatedTimeLoop(asyncio.SelectorEventLoop):
 
 
 class _NeverWaiting(selectors.DefaultSelector):
-    """Advances the time of its loop instead of waiting."""
+    """A selector that advances the time of its loop instead of waiting."""
 
     def __init__(self, loop: SimulatedTimeLoop) -> None:
         super().__init__()
@@ -53,13 +53,13 @@ class _NeverWaiting(selectors.DefaultSelector):
 
     @override
     def select(self, timeout: float | None = None) -> list[Any]:
-        """Return what is ready now."""
+        """Return the files that are ready now."""
         self._loop.now_s += timeout or 0.0
         return super().select(0)
 
 
 class Port:
-    """One port: the mood of its device, and the drivers that have it open."""
+    """One port: the behaviour of its device, and the number of drivers that have it open."""
 
     def __init__(self) -> None:
         self.mood, self.opened = "well", 0
@@ -80,7 +80,7 @@ class Supervised(RuleBasedStateMachine):
         self.pass_time(0.0)
 
     async def run(self) -> None:
-        """Own the tasks, as the daemon does."""
+        """Run the tasks of all sources until `stop` is set."""
         async with asyncio.TaskGroup() as tasks:
             self.sources = SourceTasks(tasks, self.deliver)
             await self.stop.wait()
@@ -99,7 +99,7 @@ class Supervised(RuleBasedStateMachine):
         return Source(name, "imu", "test", rate_hz, "thigh", None, self.driver_class(name))
 
     def driver_class(self, name: str) -> Any:
-        """Return the driver of one port, always the same."""
+        """Return the driver class of one port, which is always the same object."""
         port = self.ports[name]
 
         class Driver:
@@ -158,7 +158,7 @@ class Supervised(RuleBasedStateMachine):
 
     @rule()
     def change_during_a_restart(self) -> None:
-        """A device is lost while its port closes."""
+        """Lose every device while its port closes."""
         for name in NAMES:
             self.ports[name].mood = "lost"
         self.pass_time(0.1)
@@ -176,7 +176,7 @@ class Supervised(RuleBasedStateMachine):
 
     @override
     def teardown(self) -> None:
-        """Once all devices work, all sources stream, a misconfigured one within its pause."""
+        """Repair all devices: every source streams, a misconfigured one after its pause."""
         for port in self.ports.values():
             port.mood = "well"
         self.pass_time(PAUSE_S + 2.0)
@@ -191,7 +191,7 @@ class Supervised(RuleBasedStateMachine):
 
 @pytest.fixture(autouse=True)
 def no_real_devices(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The settings of these sources name no port."""
+    """Disable the waiting for device files, because the sources of these tests have no port."""
     path = "jointfit_daemon.supervisor._source_tasks.device_path"
     monkeypatch.setattr(path, lambda _: None)
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class Refused:
-    """A driver that may not open its port until somebody mends the permissions."""
+    """A driver that has no permission to open its port until `mended` is set."""
 
     mended = False
     opened = 0
@@ -57,7 +57,7 @@ async def test_paused_source_is_retried_and_reported_once(
         (closed,) = events
         assert isinstance(closed, SourceClosed)
         assert "add the user to group dialout (retrying" in closed.text
-        assert caplog.text == ""  # the core reports it, on the log too
+        assert caplog.text == ""  # the core reports it, also in the log
         await sources.stop()
 
 
@@ -102,7 +102,7 @@ async def test_paused_source_is_retried_at_a_reload(table: dict[str, Any]) -> No
         await sources.apply([source])
         await asyncio.sleep(0.05)
         assert driver.opened == 1
-        await sources.apply([source])  # it runs: it keeps its port
+        await sources.apply([source])  # a running driver keeps its port
         await asyncio.sleep(0.05)
         assert driver.opened == 1
         await sources.stop()

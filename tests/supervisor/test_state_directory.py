@@ -61,8 +61,11 @@ def test_a_link_in_place_of_the_lock_is_not_followed(tmp_path: Path) -> None:
     assert not target.exists()
 
 
-def test_files_of_earlier_daemons_become_private_and_others_stay(tmp_path: Path) -> None:
-    ours = tmp_path / "calibrations" / "s" / "0001.json"
+@pytest.mark.parametrize("folder", ["calibrations", "recordings", "spool"])
+def test_files_of_earlier_daemons_become_private_and_others_stay(
+    tmp_path: Path, folder: str
+) -> None:
+    ours = tmp_path / folder / "s" / "0001.json"
     theirs = tmp_path / "notes" / "text"
     for path in (ours, theirs):
         path.parent.mkdir(parents=True)

@@ -57,13 +57,13 @@ def test_status_line_of_a_rig_without_cameras_omits_them() -> None:
 
 def test_frame_rate_is_that_since_the_last_call() -> None:
     pace = FrameRateCounter()
-    assert pace.rate_hz(7, 100.0) != pace.rate_hz(7, 100.0)  # NaN: nothing to compare with, no time
+    assert pace.rate_hz(7, 100.0) != pace.rate_hz(7, 100.0)  # NaN: no time has passed
     assert pace.rate_hz(507, 110.0) == 50.0
     assert pace.rate_hz(507, 120.0) == 0.0
 
 
 class StatusLineDriver:
-    """Sends one byte, or ends as it is told to, when it is let go."""
+    """A driver that waits for an event, and then sends one byte or ends, depending on its name."""
 
     def __init__(self, settings: str) -> None:
         self._id = settings

@@ -74,7 +74,7 @@ def test_damaged_store_is_reported(rig: Rig, tmp_path: Path) -> None:
 
 
 async def test_worker_ends_with_its_parent(tmp_path: Path) -> None:
-    """The parent below starts a worker on an endless job and is then killed outright."""
+    """The parent process starts a worker with an endless job and is then killed."""
     parent = (
         "import subprocess, sys, time\n"
         "worker = subprocess.Popen([sys.executable, '-c', sys.argv[1]], stdin=subprocess.PIPE)\n"
@@ -99,7 +99,7 @@ async def test_worker_ends_with_its_parent(tmp_path: Path) -> None:
     process.stdin.close()
     pid = int(await process.stdout.readline())
     await asyncio.sleep(1.0)
-    os.kill(pid, 0)  # it works
+    os.kill(pid, 0)  # the worker runs
     process.kill()
     await process.wait()
     async with asyncio.timeout(10):

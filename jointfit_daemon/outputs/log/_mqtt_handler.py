@@ -14,7 +14,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 RATE_HZ = 5.0
-"""Permitted rate and burst of messages on ``bridge/log``, messages per second."""
+"""Permitted rate on ``bridge/log``, messages per second, and permitted number of messages without
+waiting.
+"""
 
 
 class MqttLogHandler(logging.Handler):

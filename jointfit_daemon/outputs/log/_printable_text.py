@@ -49,13 +49,15 @@ def printable_data(data: Any, depth: int = 0) -> Any:
 
 
 class PrintableRecord(logging.LogRecord):
-    """A log record whose further lines begin with a bar, so that no line imitates a log entry.
+    """A log record in which every line after the first begins with a bar.
+
+    No line can therefore imitate another log entry.
 
     The class is installed by ``logging.setLogRecordFactory``, so all handlers use it.
     """
 
     @override
     def getMessage(self) -> str:
-        """Return the message; control characters are escaped and further lines indented."""
+        """Return the message with escaped control characters and a bar before each further line."""
         lines = super().getMessage().splitlines()
         return "\n  | ".join(map(printable, lines))

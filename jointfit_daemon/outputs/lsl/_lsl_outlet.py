@@ -23,11 +23,12 @@ if TYPE_CHECKING:
 _NAN = math.nan
 _NAN_4, _NAN_3 = (_NAN,) * 4, (_NAN,) * 3
 _READINGS = 5
-"""Number of readings of the clock pair. The pair with the shortest duration is used."""
+"""Number of measurements of the offset between CLOCK_MONOTONIC and the clock of LSL. The shortest
+measurement is used."""
 _AGAIN_NS = 1_000_000_000
 """Interval between measurements of the clock offset, ns."""
 _BUFFER_S = 60
-"""Duration of samples that are buffered for a receiver that does not read, s."""
+"""Duration of the samples that are buffered for a receiver that does not read, s."""
 _Channels = list[tuple[str, str, str]]
 """Label, type and unit of each channel."""
 

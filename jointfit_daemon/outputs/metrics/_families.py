@@ -37,7 +37,8 @@ if TYPE_CHECKING:
 
 _CLOCK_STATES = ("settling", "direct", "echo", "passive", "arrival", "stale")
 _START_FIELD = 19
-"""Place of the start time after the name of the program in /proc/self/stat, in clock ticks."""
+"""Index of the start time, which is in clock ticks, among the fields of /proc/self/stat after the
+name of the program."""
 _Device = dict[str, tuple[str, "Callable[[DeviceHealth], float | None]"]]
 
 _COUNTERS: _Device = {

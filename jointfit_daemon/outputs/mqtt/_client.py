@@ -53,8 +53,8 @@ class MqttClient:
     Raises
     ------
     BrokerLostError
-        The broker is absent or disconnected. Entering the block, all methods and the iteration
-        raise it.
+        The broker is absent or disconnected. Entering the block, any method and the iteration over
+        the messages can raise this error.
     """
 
     def __init__(self, settings: MqttSettings) -> None:

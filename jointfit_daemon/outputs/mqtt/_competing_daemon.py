@@ -30,11 +30,11 @@ if TYPE_CHECKING:
 SHORT_S = 5.0
 """Connection time after which a daemon counts as established and earlier losses are ignored, s."""
 NEWCOMER_S = 0.25
-"""Limit for the duration of the first connection after one loss, s. It is several times the time
-that the other daemon needs to reconnect."""
+"""Limit for the duration of the first connection after one loss, s. The other daemon needs only a
+fraction of this time to reconnect."""
 UNEXPLAINED = 3
-"""Number of consecutive short connections, ended without a reason from the broker, that raise the
-suspicion. MQTT 3.1.1 has no reasons, and some MQTT 5 brokers send none."""
+"""Number of consecutive short connections, ended without a reason from the broker, after which
+another daemon is suspected. MQTT 3.1.1 has no reasons, and some MQTT 5 brokers send none."""
 STORED_S = 0.1
 """Time to wait for the stored state of a daemon after two exchanges with the broker, s. Some
 brokers send stored messages only after they confirm the subscription."""
@@ -55,8 +55,8 @@ class TakeoverDetector:
     def suspects(self, lasted_s: float, *, taken_over: bool) -> bool:
         """Return whether an older daemon probably ended the last connection.
 
-        The result is True after n consecutive short connections if the broker gave the reason for
-        the last loss, and after n + 2 otherwise. In addition, the first connection must have been
+        Let n be the number of consecutive short connections, minus 2 if the broker gave no reason
+        for the last loss. The result is True if n is at least 1, and the first connection was
         shorter than ``NEWCOMER_S * 2**(n - 1)``. The first connection of an established daemon
         counts as `SHORT_S` long, so that one of two established daemons also gives way.
 
@@ -72,8 +72,8 @@ class TakeoverDetector:
             self._losses = 0
             return False
 
-        # Later connections of a series depend on the waits of both daemons, not on their start
-        # times.
+        # The durations of later connections of a series depend on the waits of both daemons, not
+        # on their start times.
         if self._losses == 0:
             self._first_s = max(self._first_s, lasted_s)
         self._losses += 1

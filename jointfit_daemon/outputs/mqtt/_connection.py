@@ -75,7 +75,7 @@ _SOCKET_OPTIONS = (
 
 
 class BrokerLostError(Exception):
-    """The broker is absent, refuses the connection, does not answer or disconnected.
+    """The broker is absent, refuses the connection, does not answer, or has disconnected.
 
     A new attempt may succeed.
     """
@@ -149,8 +149,8 @@ class MqttConnection:
     Raises
     ------
     BrokerLostError
-        Any method raises it if the connection fails; the message names the broker and the
-        operation.
+        The connection failed; the message names the broker and the operation. Any method can raise
+        this error.
     """
 
     def __init__(
@@ -459,7 +459,7 @@ class _Client(aiomqtt.Client):
     def _on_disconnect(  # type: ignore[explicit-override]  # typing.override is Python 3.12's
         self, client: Any, userdata: Any, flags: Any, reason_code: Any, properties: Any = None
     ) -> None:
-        """Store the reason of a disconnect, because the error of a failing task may not contain it.
+        """Store the reason of a disconnect, which the error of a failing task may lack.
 
         A connection that ends before its acceptance fails at once, without the timeout of aiomqtt.
         """

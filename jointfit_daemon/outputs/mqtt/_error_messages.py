@@ -110,7 +110,7 @@ def broker_fault(error: BaseException) -> str:
 def session_fault(error: BaseException) -> str:
     """Return cause and remedy of a failed operation on an established connection.
 
-    The error numbers of an operation are those of paho: 4 means "not connected", whereas the MQTT
+    The error numbers of an operation are numbers of paho: 4 means "not connected", whereas the MQTT
     reason code 4 means "wrong password".
     """
     text = str(error)

@@ -49,8 +49,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 ECHO_S = 5.0
-"""Time within which the broker must return the daemon's own message, s. Otherwise the broker's
-access list may forbid the message."""
+"""Time within which the broker must return the daemon's own message, s. If the message does not
+come back, the broker's access list may forbid it."""
 REQUEST_RATE_HZ = 10.0
 """Permitted mean rate of requests, 1/s. A person needs several seconds per request."""
 REQUEST_BURST = 20.0
@@ -61,8 +61,8 @@ whether the broker refuses the topic."""
 _NOTICE_S = 10.0
 """Shortest interval between log lines on ignored requests, s."""
 _CORRECTION_S = 0.1
-"""Delay before ``bridge/state`` of another process is overwritten, s. The delay limits such
-messages to ten per second."""
+"""Delay before ``bridge/state`` of another process is overwritten, s. The delay limits the
+corrections to ten per second."""
 _POLL_S = 0.01
 """Interval between checks whether the outbox is empty, s."""
 _FIRST_RETRY_S = 0.05
@@ -218,7 +218,7 @@ class MqttPublisher:
             delay_s = min(2 * delay_s, _LAST_RETRY_S)
 
     async def flush(self, within_s: float, *, streams: bool = False) -> None:
-        """Wait until the broker has accepted responses, state and events, at most `within_s`.
+        """Wait at most `within_s` until the broker has accepted responses, state and events.
 
         If the daemon is not connected, the method returns at once. With `streams`, it also waits
         until all other messages are sent.
@@ -340,7 +340,7 @@ class MqttPublisher:
         if message.written is not None and not message.qos:
             message.written()
         if message.qos and self._modern:
-            # Log if the broker begins or stops to accept messages on this topic.
+            # Log when the broker begins to refuse messages on this topic.
             topic = message.topic
             if topic.startswith(responses := topics.RESPONSE.name(self._base)):
                 topic = responses + "#"  # clients choose the last levels, so all share one entry
@@ -417,7 +417,7 @@ class MqttPublisher:
         self._outbox.retain(self._outbox.state_topic, ONLINE)
 
     async def _await_echo(self, topic: str) -> None:
-        """Check that messages on `topic` come back; brokers acknowledge forbidden messages, too."""
+        """Check that messages on `topic` come back; an acknowledgement may hide a refusal."""
         echo = self._echoes[topic]
         await echo.sent.wait()
         try:

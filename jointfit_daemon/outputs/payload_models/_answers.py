@@ -45,7 +45,7 @@ class RateAnswer(Table):
 
 
 class OnlineRefit(Table):
-    """Last refit by online learning: RMS errors against the cameras on its newest frames."""
+    """Last refit by online learning: RMS errors against the cameras on the newest frames."""
 
     rounds: int = Field(description="number of accepted refits since the functional phase")
     from_version: int | None
@@ -108,7 +108,7 @@ class RecordAnswer(Table):
 
     directory: str
     file: str = Field(
-        description="name of the open or, if none is open, of the last file; may be empty"
+        description="name of the open file, or of the last file if none is open; may be empty"
     )
     duration_s: float = Field(description="from the start of the recording to now, or to its end")
     written_bytes: int

@@ -115,7 +115,7 @@ class Lag(Table):
 
 
 class Learning(Table):
-    """Online learning."""
+    """State of online learning."""
 
     state: Literal["off", "waiting", "learning", "stopped"]
     reason: str | None
@@ -124,7 +124,7 @@ class Learning(Table):
 
 
 class Frames(Table):
-    """Frames since the start."""
+    """Numbers of frames since the start of the daemon."""
 
     sent: int
     empty: int
@@ -132,14 +132,14 @@ class Frames(Table):
 
 
 class CalibrationInForce(Table):
-    """Phase and version."""
+    """Phase of calibration, and version of the calibration in force."""
 
     phase: CalibrationPhase
     version: int | None
 
 
 class Process(Table):
-    """The process."""
+    """Load and memory of the daemon's process."""
 
     cpu_pct: float
     rss_bytes: int | None
@@ -159,14 +159,14 @@ class Latency(Table):
 
 
 class StateFaults(Table):
-    """Reasons why data cannot be stored."""
+    """Reasons why the daemon cannot store data; null without a fault."""
 
     fault: str | None
     not_stored: str | None
 
 
 class RecordingState(Table):
-    """State of the present recording, or of the last one."""
+    """State of the present recording, or of the last recording if none is active."""
 
     file: str
     duration_s: float

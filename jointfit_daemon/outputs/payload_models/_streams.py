@@ -26,7 +26,7 @@ class Payload(Table):
 
 
 class Angles(Table):
-    """Anatomical angles of a joint between two segments; the keys depend on its convention."""
+    """Anatomical angles of a joint; the keys depend on the angle convention of the joint."""
 
     flexion_deg: Number = None
     adduction_deg: Number = None
@@ -108,7 +108,7 @@ class JointScalars(AnglesAndRates, Payload):
 
 
 class OpticalPoseSegment(Table):
-    """Orientation of one segment by the cameras."""
+    """Orientation of one segment, measured by the cameras."""
 
     q: Vector
     residual_deg: Number
@@ -116,7 +116,7 @@ class OpticalPoseSegment(Table):
 
 
 class OpticalPoseJoint(Angles):
-    """Position and angles of one joint by the cameras."""
+    """Position and angles of one joint, measured by the cameras."""
 
     p_m: Vector
     gap_m: Number

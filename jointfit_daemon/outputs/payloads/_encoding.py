@@ -1,7 +1,7 @@
 """JSON encoding of the payloads that docs/mqtt.md documents.
 
 Invariant: the key of every quantity ends in its unit. Unknown values are null and never 0. No
-payload contains NaN, because orjson writes null instead. UNIX time exists in outputs only.
+payload contains NaN, because orjson writes null instead.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Units of a calibration's quality on MQTT: degrees, milliseconds, and four significant digits.
 
-The core uses radians and nanoseconds, and the core's tables by method have no unit in their keys.
+The core uses radians and nanoseconds, and its tables of errors by method have keys without a unit.
 Invariant: on a topic, every quantity has a unit in its own key or in the key of the table that
 contains it.
 """

@@ -1,4 +1,4 @@
-"""Reader of the records of a recording that continues after damaged records.
+"""Reading of the records of a recording. Damaged records are reported and skipped.
 
 Invariant: whatever a file contains, the only exception is `RecordingError`, and the memory used is
 at most one record of `MOST_RECORD_BYTES` and its decompressed content.
@@ -236,7 +236,7 @@ def _read_chunk(start: int, end: int, content: bytes) -> Block:
 
     data = chunk.data
     if chunk.compression == "zstd":
-        # A compressed frame that declares another size could expand to any number of bytes.
+        # A compressed frame that declares a size other than the chunk's could expand to any size.
         if zstandard.get_frame_parameters(data).content_size != chunk.uncompressed_size:
             raise _DamageError("the compressed size of a chunk contradicts its content")
         # A new decompressor is used, because a shared decompressor is not thread-safe.

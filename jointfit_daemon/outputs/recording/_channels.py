@@ -185,4 +185,4 @@ _FIELDS: dict[str, dict[str, str]] = {
         "reason": "s",
     },
 }
-"""Fields of the JSON channels, by the name of the schema. A schema without fields is an object."""
+"""Fields of the JSON channels, by the name of the schema. Any other schema permits every object."""

@@ -72,7 +72,7 @@ class RecordedMessage(NamedTuple):
     t_ns: int
     """Instant of arrival, CLOCK_MONOTONIC ns."""
     publish_t_ns: int
-    """Time to which the content refers, CLOCK_MONOTONIC ns, if it is known."""
+    """Time to which the content refers, CLOCK_MONOTONIC ns; the arrival if this time is unknown."""
     data: bytes
 
     def event(self) -> Event | None:
@@ -141,7 +141,7 @@ class RecordedPart:
 
 
 class PartSurvey(NamedTuple):
-    """State of a file."""
+    """Damaged ranges and end of a file."""
 
     damage: list[DamagedBlock]
     end: PartEnd
@@ -187,7 +187,7 @@ def _messages(
         if opcode == _MESSAGE_OPCODE and length >= _MESSAGE.size - _PREFIX.size:
             _, _, number, low, log_ns, publish_ns = _MESSAGE.unpack_from(content, place)
             # The file stores numbers modulo 2**32. The step from the previous number is far
-            # smaller.
+            # smaller than this modulus.
             expected += (low - expected + _HALF) % _SEQUENCES - _HALF
             data = content[place + _MESSAGE.size : end]
             yield RecordedMessage(
@@ -293,9 +293,9 @@ class _Sequencer:
         """Most recent damaged range, which is the reason of the next gap."""
 
     def continues(self, item: RecordedMessage) -> bool:
-        """Return whether a message follows the previous one without a gap; if so, count it.
+        """Return whether a message follows the previous message without a gap.
 
-        The result is False for snapshots.
+        If so, its number is stored. The result is False for snapshots.
         """
         if item.sequence != self._expected or _channel_parts(item.channel)[0] in _RESTORING:
             return False

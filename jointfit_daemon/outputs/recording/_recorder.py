@@ -36,12 +36,12 @@ if TYPE_CHECKING:
 
 FLUSH_S = 0.3
 """Interval between the starts of two writes, s. If the daemon is killed, the messages of this
-interval and of two writes are lost."""
+interval and of the duration of two writes can be lost."""
 _SHORTEST_PAUSE_S = 0.02
 """Shortest pause between two writes, s; it applies to slow disks."""
 PENDING_BYTES = 16 * 1024 * 1024
-"""Largest memory for messages that wait for a slow disk, bytes. Four IMUs fill it in ten
-seconds."""
+"""Largest memory for messages that wait for a slow disk, bytes. The messages of four IMUs fill it
+in ten seconds."""
 _MESSAGE_BYTES: dict[type, int] = {LimbState: 6000}
 """Memory that a message occupies, by its type, bytes."""
 _OTHER_BYTES = 500
@@ -52,7 +52,7 @@ _FREE_S = 5.0
 
 @dataclass(frozen=True, slots=True)
 class RecordingHealth:
-    """State of the current recording; of the last recording if none is running."""
+    """State of the current recording, or of the last recording if none is running."""
 
     file: str = ""
     """Name of the open file, or of the last file if none is open; empty if there was none."""
@@ -83,7 +83,7 @@ class Recorder:
     limits
         Limits at which a file ends and at which old files are deleted.
     report
-        Function that is called at each interruption and resumption of writing.
+        Function that is called with each change to report, such as an interruption of writing.
     autostart
         Whether recording starts with the first event.
     describe
@@ -172,7 +172,7 @@ class Recorder:
     # --- state -------------------------------------------------------------------------------
 
     def health(self) -> RecordingHealth:
-        """Return the state of the running recording, or of the last one if none is running."""
+        """Return the state of the running recording; without one, of the last recording."""
         if self._writer is None:
             return replace(self._last, free_bytes=self._free_bytes)
         return self._health(self._writer)
@@ -221,7 +221,7 @@ class Recorder:
             return self._health(writer)
 
     async def stop(self) -> RecordingHealth:
-        """Write all messages, close the file, return its last state; do nothing if none is open."""
+        """Write all messages and close the file, if one is open; return the last state."""
         async with self._changing, self._writing:
             writer = self._writer
             if writer is not None:

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def delete_oldest(directory: Path, rig: str, keep_bytes: float) -> list[Path]:
-    """Delete the oldest complete recordings of `rig` until all its files fit into `keep_bytes`.
+    """Delete the oldest complete files of `rig` until its remaining files fit into `keep_bytes`.
 
     Parameters
     ----------

@@ -60,7 +60,7 @@ _YIELD_MESSAGES, _YIELD_S = 32, 0.0005
 loop waits for the interpreter lock for less than half a millisecond."""
 _LONGEST_PAUSED_S = 0.05
 """Time after which the rest of a batch is encoded without pauses, s. On a busy machine the pauses
-take long, and a kill of the process loses unwritten messages."""
+take long, and unwritten messages are lost if the process is killed."""
 
 PROGRAM = f"jointfitd {__version__}"
 """Name and version of this program."""
@@ -261,7 +261,7 @@ class SessionWriter:
     def _create(self, info: RecordingInfo, attachments: Sequence[RecordedAttachment]) -> PartFile:
         """Create the file of `info`.
 
-        The names of all files contain the first second of the session.
+        The names of all files contain the start time of the session in whole seconds.
         """
         unix_s = (info.start_t_ns + info.unix_offset_ns) // 10**9
         while True:

@@ -1,4 +1,4 @@
-"""State of the core's inputs, which restores the state at the beginning of a recording."""
+"""State of the core's inputs, from which a replay starts at the beginning or after a gap."""
 
 from __future__ import annotations
 

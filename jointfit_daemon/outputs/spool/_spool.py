@@ -119,7 +119,7 @@ class Spool:
             self._recent.popleft()
 
     def _begin(self) -> None:
-        """Process a connection; at the first, discard messages that the outbox also contains."""
+        """Discard the pending messages at the first connection; the outbox contains them, too."""
         if not self._began:
             self._began = True
             self._pending.clear()
@@ -148,7 +148,10 @@ class Spool:
         )
 
     async def run(self) -> None:
-        """Write and deliver messages until cancelled; then write those of a current outage."""
+        """Write and deliver messages until cancelled.
+
+        If the daemon is not connected at the cancellation, the remaining messages are written.
+        """
         await self._with_files(self._files.load)
         try:
             async with asyncio.TaskGroup() as tasks:

@@ -1,8 +1,8 @@
 """Files of the spool: messages in the order in which they were written, in files of limited size.
 
-A line consists of the CRC-32 of the rest in hexadecimal digits, the topic relative to the base, and
-the payload, separated by spaces. A process appends only to files that it created. A power cut can
-therefore damage only the last line of a file.
+A line consists of a CRC-32 in hexadecimal digits, the topic relative to the base, and the payload,
+separated by spaces. The CRC covers the rest of the line. A process appends only to files that it
+created. A power cut can therefore damage only the last line of a file.
 
 Invariant: after each write, the total size exceeds `keep_bytes` only if there is a single file.
 Otherwise the oldest files are deleted, and their messages are counted. A line with a wrong CRC is

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def alignment_text(quality: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the text with the deviations from the plate and the lags.
+    """Return the text with the deviations of the sensors from the plate, and the lags.
 
     Parameters
     ----------

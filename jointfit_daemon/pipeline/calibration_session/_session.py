@@ -133,7 +133,11 @@ class CalibrationSession:
 
     @property
     def may_learn(self) -> bool:
-        """Whether a refit may start: calibrated, not paused, and no phase or fit running."""
+        """Whether a refit may start.
+
+        It may start if the limb is calibrated, learning is not paused, and no phase or fit is
+        running.
+        """
         available = self.calibration is not None and not self.refits.paused
         return available and self._state in RESTING and self.refits.job is None
 

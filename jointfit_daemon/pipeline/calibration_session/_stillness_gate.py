@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 SILENT_NS = 500_000_000
 """Time without data after which a sensor counts as silent, ns."""
 REPORTED_NS = 500_000_000
-"""Shortest period of stillness whose end is reported, ns. A slow movement ends several short
-periods one after another."""
+"""Shortest period of stillness whose end is reported, ns. Without this limit, a slow movement would
+cause many reports."""
 
 
 class StillnessGate:
@@ -37,10 +37,10 @@ class StillnessGate:
         self._still = dict.fromkeys(sensors, False)
         self._last_ns: dict[str, int] = {}
         self.still_since_ns: int | None = None
-        """Instant since which all sensors are still; None while they are not still."""
+        """Instant since which all sensors have been still; None while they are not still."""
 
     def feed(self, sensor: str, t_ns: int, q_world_sensor: Quaternion) -> bool:
-        """Add one orientation; return whether it ended a stillness of at least `REPORTED_NS`."""
+        """Add one orientation; return whether it ended a still period of `REPORTED_NS` or more."""
         monitor = self._monitors.get(sensor)
         if monitor is None:
             return False

@@ -46,7 +46,7 @@ labels in the same frame."""
 OPTIONS = LiveOptions(steps=6, huber_m=0.02, restart_interval=5)
 """Options of the solver. It takes up to six steps per frame, because frames are 100 ms apart. The
 Huber threshold limits the influence of an exchanged marker until it is excluded. A restart takes
-longer than a frame, so unsuccessful restarts become less frequent."""
+longer than the fit of a frame, so the solver restarts less often after unsuccessful restarts."""
 
 
 class _FrameErrors(NamedTuple):

@@ -43,15 +43,16 @@ LOST_REPORT_NS = 10_000_000_000
 frequent."""
 _MOST_EXCLUDED = 1 / 3
 _MEMORY = 0.02
-"""Weight of a new frame in the mean position of a misplaced marker, equal to 5 s at 10 Hz."""
+"""Weight of a new frame in the mean position of a misplaced marker. At 10 Hz, the time constant of
+the mean is 5 s."""
 _OBSERVED = 50
 """Number of frames after which the movement of a misplaced marker is compared with the segments."""
 _RIGID_M = 0.012
-"""Standard deviation of a marker in the axes of a segment, m, below which it is attached to this
-segment."""
+"""Standard deviation of a marker's position in the axes of a segment, m, below which the marker is
+attached to this segment."""
 _MOVING_M = 0.025
-"""Standard deviation of a marker in the axes of its own segment, m, above which it is not attached
-to this segment."""
+"""Standard deviation of a marker's position in the axes of its own segment, m, above which the
+marker is not attached to this segment."""
 
 
 class MarkerReport(NamedTuple):
@@ -67,7 +68,7 @@ class MarkerReport(NamedTuple):
 
 @dataclass(slots=True)
 class _Observation:
-    """Mean and variance of a misplaced marker in the axes of every segment."""
+    """Mean (m) and variance (m²) of a misplaced marker's position in the axes of every segment."""
 
     mean: Array
     variance: Array
@@ -129,7 +130,7 @@ class MarkerMonitor:
         self._labels.advance(t_ns)
 
     def update(self, t_ns: int, seen: NDArray[np.bool_]) -> list[MarkerReport]:
-        """Store which markers are visible in a frame, shape (M,).
+        """Store which markers are visible in a frame; `seen` has the shape (M,).
 
         Return reports of markers that were hidden for `LOST_REPORT_NS`, or that are visible again.
         """
@@ -206,7 +207,10 @@ class MarkerMonitor:
         return f"{kind}:{'~'.join(self.model.markers[m].name for m in markers)}"
 
     def _lasting(self, t_ns: int, condition: str, flags: Iterable[str], least_ns: int) -> set[str]:
-        """Return the flags whose condition has lasted for `least_ns`; forget all other flags."""
+        """Return the `flags` whose condition has lasted for `least_ns`.
+
+        The start of the condition is forgotten for every flag that is not in `flags`.
+        """
         before = self._since_ns.get(condition, {})
         now = self._since_ns[condition] = {flag: before.get(flag, t_ns) for flag in flags}
         return {flag for flag, since_ns in now.items() if t_ns - since_ns >= least_ns}

@@ -82,7 +82,7 @@ class SegmentLabels:
         self._rms: Array = np.full(len(self._names), np.nan)
 
     def begin(self, t_ns: int, measured: Array) -> None:
-        """Start a search in the labels of a frame, if it is due and no search is running.
+        """Start a search in the labels of a frame if a search is due and none is running.
 
         Parameters
         ----------

@@ -1,8 +1,8 @@
 """Collection of training frames for online learning: pairs of sensor and mocap frames.
 
 Ten frames per second are examined. A frame is retained if all sensors and markers are present, the
-clocks are synchronized, and no sensor fault is flagged. While the subject does not change the
-posture, one frame per second is retained.
+clocks are synchronized, and no sensor fault is flagged. While the posture of the subject does
+not change, one frame per second is retained.
 
 Invariant: the size of the collection is limited, and no frames are paired across a restart of a
 clock.
@@ -44,8 +44,8 @@ MAX_FRAMES = 3000
 MIN_FRAMES = 600
 """Number of frames required for a refit, equal to one minute of movement."""
 REFIT_NS = 180_000_000_000
-"""Shortest time between two refits, ns. The first refit waits for the same time after there are
-enough frames."""
+"""Shortest time between two refits, ns. The first refit starts at this time after
+`MIN_FRAMES` frames were retained."""
 _FAULTS = {
     FrameFlag.STUCK: "sensor repeats its value",
     FrameFlag.SLIPPED: "sensor slipped",
@@ -221,7 +221,7 @@ class OnlineFrameCollector:
     # --- pairs -------------------------------------------------------------------------------
 
     def _pair(self, t_ns: int, mocap: list[Array]) -> None:
-        """Pair a mocap frame with the sensors at its instant, and retain the pair if it is due."""
+        """Pair a mocap frame with the sensor data of its instant; retain the pair if it is due."""
         after = None
         for before in reversed(self._frames):
             if before.t_ns <= t_ns:

@@ -1,4 +1,4 @@
-"""State of online learning: whether it is possible, and reason and duration of an obstacle.
+"""State of online learning: whether it is possible, and the reason and duration of an obstacle.
 
 An obstacle that lasts for `REPORT_NS` is reported once, and its end is reported once. The absence
 of the subject from the view of the cameras is not an obstacle.

@@ -27,8 +27,8 @@ _EXCHANGE_RAD = 2.5
 _EXCHANGE_NS = 200_000_000
 """Longest time between two frames for the check of exchanged labels, ns."""
 _MEMORY = 0.02
-"""Weight of a new frame in two running means: the squared residual and the share of loose
-frames."""
+"""Weight of a new frame in two running means: the squared residual, and the share of frames with
+displaced markers."""
 _MOST_LOOSE = 0.1
 """Share of frames with displaced markers above which the segment has no pose."""
 
@@ -72,7 +72,7 @@ class PlanarSegment:
 
     @property
     def flat_template(self) -> NDArray[np.float64]:
-        """Template in real coordinates, m, shape (m, 2) for m markers."""
+        """Template in real coordinates, m, shape (k, 2) for k markers."""
         template = np.zeros(0) if self.template is None else self.template
         return np.column_stack((template.real, template.imag))
 
@@ -89,7 +89,7 @@ class PlanarSegment:
         t_ns
             Instant of the frame.
         z
-            Positions of the m markers in the plane, m, shape (m,); NaN where missing.
+            Positions of the k markers in the plane, m, shape (k,); NaN where missing.
         """
         seen = np.isfinite(z)
         if self.template is None and seen.all():

@@ -1,10 +1,10 @@
 """Joint positions and stick figure of a planar chain in operation.
 
-A joint connects two body parts. If a part has at least two markers, its pose is known. In its
-coordinates, each marker of the adjacent part moves on a circle about the joint. A running circle
-fit, in which older frames lose weight, estimates the center and predicts its error. A part at the
-end of the chain needs only one marker. Source: Akbarifar et al., Iranian Journal of Biomedical
-Engineering 15 (2021), 1-11.
+A joint connects two body parts. If a part has at least two markers, its pose is known. In the
+coordinates of this part, each marker of the adjacent part moves on a circle about the joint. A
+running circle fit, in which older frames lose weight, estimates the center and predicts its error.
+A part at the end of the chain needs only one marker. Source: Akbarifar et al., Iranian Journal of
+Biomedical Engineering 15 (2021), 1-11.
 
 Invariant: the result depends neither on an IMU nor on a calibration.
 """

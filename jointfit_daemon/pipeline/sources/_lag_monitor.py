@@ -40,8 +40,8 @@ WINDOW_NS = 10_000_000_000
 HOP_NS = 2_500_000_000
 """Time between the starts of successive windows, ns."""
 MARGIN_NS = 300_000_000
-"""Time before and after the window whose samples are also used, ns: for the lag, and for the filter
-at the ends of the window."""
+"""Time before and after the window, ns. Its samples are used as well, because of the lag and of the
+filter at the ends of the window."""
 DRIFT_FAULT = 2e-6
 """Drift of the lag between two synchronized clocks, ns/ns. A larger drift means that a clock fit is
 wrong."""
@@ -53,7 +53,8 @@ means that one of the two lags is wrong."""
 RESTART_SD_NS = 1_000_000.0
 """Standard deviation by which the lag may change when a clock restarts, ns."""
 MAX_SAMPLES = 6_000
-"""Largest number of retained samples per sensor, and of mocap frames: a window at 500 Hz."""
+"""Largest number of retained samples per sensor, and of mocap frames. It is sufficient for a window
+with its margins at 500 Hz."""
 _FRAMES_PER_STEP = 150
 _MIN_FRAMES = 100
 
@@ -64,7 +65,7 @@ on the skin, which is not a fault."""
 
 
 class KnownLag(NamedTuple):
-    """Lag that is not estimated: ``lag_ms`` in rig.toml, from a sync line or a measurement."""
+    """Lag ``lag_ms`` of rig.toml, which is known from a sync line or a measurement."""
 
     lag_ns: float
     sigma_ns: float
@@ -126,7 +127,7 @@ class LagMonitor:
     before : LagMonitor, optional
         Monitor whose estimates are continued, because a new calibration does not change the clocks.
     known : mapping, optional
-        Lags from rig.toml, which are used. The estimates only check them.
+        Lags from rig.toml. They are used instead of estimated lags, which only check them.
     """
 
     def __init__(

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import Source
 
 CAN_MS = (0.1, 0.1)
-"""Mean and standard deviation of the delay on a CAN bus, ms, equal to one CAN frame at 1 Mbit/s."""
+"""Mean and standard deviation of the delay on a CAN bus, ms; a CAN frame at 1 Mbit/s takes 0.1 ms.
+"""
 UART_MS = (0.2, 0.2)
 """Mean and standard deviation of the delay on a UART, ms."""
 USB_MS = (1.0, 0.7)

@@ -98,7 +98,7 @@ class SourceState:
         """Start with a new decoder after the source was opened.
 
         The next sample of an IMU shows whether the IMU's clock restarted in the meantime. The clock
-        fit of a mocap server converges within a second, so its old fit is discarded.
+        fit of a mocap server converges within a second, so the old fit is discarded.
         """
         if self.counts.opened and self.source.kind == "mocap":
             self.clock.feed_restart()
@@ -268,7 +268,7 @@ class SourceState:
         return events
 
     def _identity_events(self, item: Corrupt | DeviceEvent) -> list[DeviceEvent]:
-        """Return a warning if the device's serial number is not that of the calibrated sensor."""
+        """Return a warning if the device is not the calibrated sensor, by its serial number."""
         if not isinstance(item, DeviceEvent) or item.kind != "info" or "serial" not in item.data:
             return []
         text = exchanged_sensor(self.source.settings, item.data["serial"])

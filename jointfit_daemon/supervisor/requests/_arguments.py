@@ -24,7 +24,7 @@ class RequestArguments(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    transaction: str = Field("", max_length=256, description="text of the client, sent back")
+    transaction: str = Field("", max_length=256, description="text that the answer repeats")
 
 
 class CalibrateArguments(RequestArguments):
@@ -157,7 +157,7 @@ REQUESTS: dict[str, RequestKind] = {
         UseCalibrationArguments, "Use a stored calibration again, or the previous one."
     ),
     "selftest": RequestKind(SelftestArguments, "Check devices, clocks, store, broker and host."),
-    "record": RequestKind(RecordArguments, "Start or stop to record, or return the state."),
+    "record": RequestKind(RecordArguments, "Start or stop recording, or return the state."),
     "physical-test": RequestKind(
         PhysicalTestArguments, "Test world, axes and direction of a sensor by three rotations."
     ),

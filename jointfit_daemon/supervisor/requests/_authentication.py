@@ -59,7 +59,7 @@ class RequestAuthenticator:
         self._used: OrderedDict[str, int] = OrderedDict()
 
     def continuing(self, before: RequestAuthenticator | None) -> RequestAuthenticator:
-        """Return `before`, which knows the used nonces, if its key is the same; otherwise this."""
+        """Return `before`, which knows the used nonces, if it has the same key; else `self`."""
         if before is not None and self.fingerprint == before.fingerprint:
             return before
         return self

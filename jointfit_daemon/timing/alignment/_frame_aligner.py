@@ -6,14 +6,14 @@ frame is emitted once, in order. Every sample has exactly one outcome.
 Frame k has the instant ``t_k = k period`` of host CLOCK_MONOTONIC, so the grid does not depend on
 the start time. The frame is emitted when every active stream has a sample at or after t_k, or at
 the deadline of the frame. Each stream has a deadline: the usual arrival of its next sample plus at
-most 1.5 of its periods. The deadline of the frame is the latest of them. If a sample is missing,
-the orientation of its stream is extrapolated by up to 2.5 periods. Later frames do not contain the
-stream.
+most 1.5 of its periods. The deadline of the frame is the latest deadline of a stream. If a sample
+is missing, the orientation of its stream is extrapolated by up to 2.5 periods. Frames after this
+time do not contain the stream.
 
 Invariant: frames never stop. While no stream has samples, frames without orientations are emitted.
-The first of these frames is emitted when every stream counts as lost, the others at the usual
-delay. Frames are skipped only if the whole process was stopped for more than a second, so that the
-caller did not request them.
+The first of these frames is emitted when every stream counts as lost. Each later frame waits for
+the usual delay of the streams. Such frames are skipped only if the whole process was stopped for
+more than a second, so that the caller could not request them.
 
 In mode ``fast`` a frame is complete if the last sample of each stream precedes t_k by at most one
 period of the stream. The orientation is extrapolated to t_k. Frames are therefore emitted up to one
@@ -36,8 +36,8 @@ Mode = Literal["smooth", "fast"]
 """``smooth`` waits for samples and interpolates; ``fast`` extrapolates by at most one period."""
 
 OWED_NS = 1_000_000_000
-"""Age, ns, above which frames without orientations are skipped. Otherwise a process that was
-stopped for an hour would emit 360 000 such frames at 100 Hz.
+"""Age, ns, above which frames without orientations are skipped. Without this limit, a process that
+was stopped for an hour would emit 360 000 of these frames at 100 Hz.
 """
 
 
@@ -53,7 +53,7 @@ class AlignedFrame(NamedTuple):
     missing: frozenset[str]
     synced: bool
     """Whether the clocks of all `orientations` have settled. A frame without orientations has the
-    value of the last frame with orientations, until all streams have ended.
+    value of the last frame with orientations. The value is False when all streams have ended.
     """
 
 
@@ -72,7 +72,7 @@ class FrameAligner:
     mode : {"smooth", "fast"}
         ``smooth`` waits for samples, ``fast`` extrapolates.
     begin_ns : int, optional
-        Earliest instant of the first frame, with or without samples, ns; by default the instant of
+        Instant from which frames are emitted, even without samples, ns; by default the instant of
         the first sample.
 
     Raises
@@ -98,15 +98,14 @@ class FrameAligner:
         self._next = None if begin_ns is None else -(-begin_ns // period_ns)
         """Number k of the next frame; None before the first sample."""
         self._served: int | None = None  # number of a frame for which a stream has data
-        self._serves_ns: int | None = None  # first instant with data of a stream
+        self._serves_ns: int | None = None  # first instant for which a stream has data
         self._completed_ns = 0
         self._synced = False
         """Whether the clocks of the last frame had settled."""
         self._deadline_ns: int | None = None
         self._changed = True  # whether `_deadline_ns` must be computed again
         self._dues: dict[str, int] = {}
-        """Host time at which each stream is ready for the next frame, ns; empty until first
-        computed.
+        """Host time at which each stream is ready for the next frame, ns; empty if not computed.
         """
         self.skipped_frames = 0
         """Number of skipped frames; ``OWED_NS`` defines when a frame is skipped."""
@@ -297,7 +296,7 @@ class FrameAligner:
     # --- control -----------------------------------------------------------------------------
 
     def lose(self, name: str) -> None:
-        """Mark a stream as ended; frames do not wait for it until it returns."""
+        """Mark a stream as ended; frames do not wait for it until its next sample."""
         self._streams[name].lose()
         self._changed, self._served = True, None
 

@@ -24,7 +24,7 @@ _CONTRADICTS = 0.25
 """Largest accepted relative difference between a rotation and the integral of the measured rates.
 """
 _CONTRADICTS_RAD = 0.02
-"""Absolute difference that is accepted in addition, rad."""
+"""Absolute difference that is accepted in addition to the relative difference, rad."""
 
 
 class OrientationSample(Protocol):
@@ -36,7 +36,7 @@ class OrientationSample(Protocol):
     """Angular rate in the sensor's own frame at ``t_ns``, rad/s; None if not measured."""
     turn: Vector | None
     """Rotation vector from the previous sample to this sample, rad. The value is cached. It is None
-    until it is computed, and None again after a sample was inserted between the two.
+    until it is computed, and None again after a sample was inserted between the two samples.
     """
 
 
@@ -54,7 +54,7 @@ def interpolate_orientation(
 
     where :math:`h_0, h_1` are the intervals before and after `a`. Without `before` the result is a
     spherical linear interpolation (slerp). The error of the parabola is of third order in the
-    interval, the error of slerp of second order.
+    interval, and the error of slerp is of second order.
 
     Parameters
     ----------
@@ -152,9 +152,9 @@ def _agree(start: Vector, end: Vector, turn: Vector, h: float) -> bool:
 
 
 def _hermite(start: Vector, end: Vector, turn: Vector, x: float, h: float) -> Vector:
-    """Return the value, `x` s after the start, of a cubic from 0 to `turn` in `h` s.
+    """Return the value, rad, at `x` s of the cubic that goes from 0 to `turn` rad in `h` s.
 
-    `start` and `end` are the body rates at both ends.
+    `start` and `end` are the body rates at both ends, rad/s.
 
     The tangent at the end is the rate `end` multiplied by the inverse right Jacobian of `turn`,
     ``w + r × w / 2 + r × (r × w) / 12`` with w = `end` and r = `turn`, accurate to third order.

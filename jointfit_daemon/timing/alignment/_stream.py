@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 CAPACITY = 512
 """Largest number of pending samples."""
 PATIENCE = 1.45
-"""Periods to wait for a sample beyond its usual delay. With the ripple of the delay estimate the
-wait stays below 1.5 periods.
+"""Periods to wait for a sample beyond its usual delay. The delay estimate varies from
+sample to sample; with this variation, the wait stays below 1.5 periods.
 """
 REACH = 2.5
 """Largest extrapolation after the last sample, periods."""
@@ -31,7 +31,7 @@ CROWDED = 0.5
 close together while a clock settles.
 """
 LOST_PERIODS = 3
-"""Silence after which a stream counts as lost, periods."""
+"""Silence after which a stream counts as lost, periods; at least `LOST_LEAST_NS`."""
 LOST_LEAST_NS = 50_000_000
 """Least silence after which a stream counts as lost, ns."""
 FUTURE_NS = 100_000_000
@@ -42,14 +42,14 @@ DELAY_MOST_NS = 250_000_000
 """Largest delay that frames wait for, ns."""
 
 _EARLY = 20
-"""The deadline of a frame follows from the first sample that is expected no earlier than 1/20
-period before the frame. Jitter may place this sample after the frame.
+"""The deadline of a frame is computed from the first sample whose expected instant is after the
+frame, or at most 1/20 period before it. With jitter, the real instant may then be after the frame.
 """
 _DELAY_STEP = 128
 """The usual delay decreases by at most 1/128 period per sample."""
 _DELAY_UP = 3
-"""Ratio of an increase to a decrease of the usual delay. With the ratio 3 the usual delay converges
-to the 75th percentile of the delays.
+"""Ratio of the largest increase to the largest decrease of the usual delay. With the ratio 3 the
+usual delay converges to the 75th percentile of the delays.
 """
 _BEHIND = 3
 """Number of samples at or before a frame that extrapolation needs."""
@@ -63,7 +63,7 @@ class SampleOutcome(StrEnum):
     DECIMATED = "decimated"
     """Skipped, because the stream is faster than the frames."""
     LATE = "late"
-    """Sample that arrived after all frames that needed this sample."""
+    """Sample that arrived after the emission of all frames that needed this sample."""
     DUPLICATE = "duplicate"
     """Sample with the same time as another sample."""
     DROPPED = "dropped"
@@ -114,7 +114,9 @@ class Stream:
         self._counts = dict.fromkeys(SampleOutcome, 0)
         self.newest_ns = self.newest_arrival_ns = 0
         self.extrapolated = self.synced = False
-        """Whether the last result of ``at`` was extrapolated; whether its samples were synced."""
+        """Whether the last result of ``at`` was extrapolated, and whether the clock had settled for
+        all samples of this result.
+        """
 
     # --- samples -----------------------------------------------------------------------------
 
@@ -162,7 +164,10 @@ class Stream:
         return None
 
     def _insert(self, sample: _Sample) -> SampleOutcome | None:
-        """Insert a reordered sample if a later frame may still need it."""
+        """Insert a reordered sample if a later frame may still need it.
+
+        Otherwise, return the outcome of the sample.
+        """
         samples = self._samples
         at = len(samples)
         while at and samples[at - 1].t_ns > sample.t_ns:

@@ -15,15 +15,17 @@ SERVER_SKEW_LIMIT_PPM = 100.0
 
 _MS, _S = 1e6, 1e9
 _BOOT_NS = 2_000_000_000
-"""Tolerance, ns, when a new device time is compared with the time elapsed since the last sample."""
+"""Tolerance, ns. The clock of a device that restarted since the last sample shows at most the time
+elapsed since then plus this tolerance.
+"""
 
 
 class ClockEvent(NamedTuple):
     """An event to be published."""
 
     kind: Literal["restart", "clock", "warning"]
-    """``restart``: the device restarted; ``clock``: only its time changed; ``warning``: check the
-    setup.
+    """``restart``: the device restarted; ``clock``: only the time of the device changed;
+    ``warning``: the setup must be checked.
     """
     text: str
     data: Mapping[str, object]
@@ -42,8 +44,8 @@ def clock_restart_event(before_ns: int, now_ns: int, elapsed_ns: int) -> ClockEv
     jump = now_ns - before_ns - elapsed_ns
     data = {"jump_ms": round(jump / _MS, 3)}
     if 0 <= now_ns <= elapsed_ns + _BOOT_NS and now_ns < before_ns:
-        up = f"its clock restarted at {now_ns / _S:.2f} s"
-        return ClockEvent("restart", f"device rebooted: {up} after {before_ns / _S:.2f} s", data)
+        change = f"from {before_ns / _S:.2f} s to {now_ns / _S:.2f} s"
+        return ClockEvent("restart", f"device rebooted: its clock went back {change}", data)
 
     direction = "back" if jump < 0 else "ahead"
     text = f"device clock jumped {direction} by {abs(jump) / _MS:.1f} ms"
@@ -60,7 +62,7 @@ def early_arrival_event(early_ns: float) -> ClockEvent:
 
 
 def late_arrival_event(late_ns: float, seconds: float) -> ClockEvent:
-    """Return the event for samples that have been late for `seconds`."""
+    """Return the event for samples that have been late by `late_ns` for `seconds`."""
     text = (
         f"samples have arrived {late_ns / _MS:.1f} ms late for {seconds:g} s: the device clock "
         "stopped for the duration of this delay"
@@ -142,7 +144,7 @@ def skew_warning(kind: str, skew_ppm: float, sigma_ppm: float) -> ClockEvent | N
         "echo": "check whether the server's operating system steps or slews its clock",
     }[kind]
     text = (
-        f"device clock skew is {skew_ppm:+.0f} ppm, more than any crystal (limit {limit:g} ppm): "
+        f"device clock skew is {skew_ppm:+.0f} ppm, too large for a crystal (limit {limit:g} ppm): "
         f"{cause}"
     )
     return ClockEvent("warning", text, {"skew_ppm": round(skew_ppm, 1)})

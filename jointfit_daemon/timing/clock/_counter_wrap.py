@@ -22,7 +22,7 @@ def unwrap(raw: int, last: int, modulus: int | None, elapsed_ns: int, turn_ns: i
     last : int
         Unwrapped count of the previous reading.
     modulus : int or None
-        Number of counter values. None is a counter that never wraps; `raw` is then returned.
+        Number of counter values. None for a counter that never wraps; `raw` is then returned.
     elapsed_ns : int
         Host time between the two arrivals, ns.
     turn_ns : int

@@ -90,7 +90,10 @@ class DelayStatistics:
 
 
 def bin_of(delay_ns: int) -> int:
-    """Return the bin of a delay; bins are linear up to 16 units, then eight per octave."""
+    """Return the bin of a delay.
+
+    Bins are linear up to 16 units of 1024 ns; above, there are eight per octave.
+    """
     units = delay_ns >> _UNIT_BITS if delay_ns > 0 else 0
     if units < _LINEAR:
         return units
@@ -100,7 +103,7 @@ def bin_of(delay_ns: int) -> int:
 
 
 def _height(bins: list[int], rank: float) -> float:
-    """Return the delay, ns, at a rank of the histogram, interpolated in its bin."""
+    """Return the delay, ns, at a rank of the histogram, interpolated within the bin."""
     below = 0
     for index, count in enumerate(bins):
         if count and below + count >= rank:

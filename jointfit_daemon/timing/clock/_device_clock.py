@@ -50,10 +50,12 @@ source."""
 CAUGHT_UP_NS = 50_000
 """Largest distance of a timestamp from its estimate at which the clock becomes synced, ns."""
 AWAY_SLACK_NS = 500_000_000
-"""Tolerance of device time after the port was closed, ns, because bytes may have been buffered."""
+"""Tolerance of the first device time after the port was closed, ns. Bytes may have been buffered
+while the port was closed.
+"""
 AWAY_TURNS = 20
-"""Least period after which the device readings repeat, in units of the tolerance. With a shorter
-period a restarted device would pass the check by chance in more than one of ten cases.
+"""Least period of the device readings for the detection of a restart, in units of the tolerance.
+Readings with a shorter period would hide a restart by chance in more than one of ten cases.
 """
 
 _ARRIVAL, _COUNTER, _TICKS = range(3)
@@ -62,10 +64,10 @@ _JITTER_GAIN = 0.01
 _ARRIVAL_SIGMA = 0.1
 """Least standard deviation of timestamps of samples that are numbered by arrival, periods."""
 _PRIOR_SIGMAS = 4.0
-"""Largest difference between direct time and the estimate, in standard deviations."""
+"""Largest accepted difference between direct time and the estimate, in standard deviations."""
 _AWAY_SHARES = 0.0, 0.02, 0.001
-"""Tolerance of device time after the port was closed, as a fraction of the elapsed time, for
-arrivals, counter and ticks."""
+"""Additional tolerance of the first device time after the port was closed, as a fraction of the
+elapsed time, for arrivals, counter and ticks."""
 _SKEW_CHECK_SAMPLES = 256
 """Number of samples between two plausibility checks of the skew."""
 
@@ -160,7 +162,7 @@ class DeviceClock:
 
     @property
     def bound_ns(self) -> float | None:
-        """Limit of the constant error, ns; None without echoes."""
+        """Limit of the constant error of the offset, ns; None without echoes."""
         return None if self._echo is None else self._echo.bound_ns
 
     @property
@@ -223,7 +225,7 @@ class DeviceClock:
                 self._direct = declared_offset(self._tick_clock, offset_ns)
 
     def feed_echo(self, echo: ClockEcho, tick_clock: TickClock | None = None) -> None:
-        """Add an answered echo; ignored while the tick rate of the device is unknown."""
+        """Add an answered echo; it is ignored while the tick rate of the device is unknown."""
         tick_clock = tick_clock or self._tick_clock
         if tick_clock is None:
             return

@@ -30,7 +30,7 @@ COUNTER_WIDTHS = (1 << 8, 1 << 16, 1 << 32)
 _GAP = 1.5
 """Least interval that is compared with the counter, in multiples of the usual interval."""
 _SLACK = 3
-"""Largest accepted difference of time and counter, counts."""
+"""Largest accepted difference between the changes of device time and counter, counts."""
 _SILENCE_LEAST_NS = 500_000_000
 """Least silence over which device time is compared with host time, ns. A busy host causes shorter
 delays.
@@ -38,7 +38,9 @@ delays.
 _SILENCE_SHARE = 0.1
 """Largest difference of device time and host time over a silence, as a fraction of the silence."""
 _BACKLOG_NS = 100_000_000
-"""Least delay of a backlog, ns, and tolerance of the first sample after the backlog."""
+"""Least delay of a backlog (samples that waited in a buffer), ns, and tolerance of the first sample
+after the backlog.
+"""
 _WRAP_SLACK = 8
 """Largest accepted difference, counts, between the change of the counter and the elapsed time at
 the first wrap. If a quarter of the elapsed time is larger, this quarter is the limit.
@@ -65,7 +67,7 @@ loss.
 """
 _LATE_LOG_CHANCE = -14.0
 """Natural logarithm of a probability, about one in a million. If a run of late samples is less
-probable by chance, samples count as lost.
+probable than this by chance, samples count as lost.
 """
 _SILENCE_NS = 2 * NS_PER_S
 """Silence after which samples without device time cannot be numbered, ns."""
@@ -119,7 +121,7 @@ class TickTime:
         return self._turn_ns
 
     def forget_counter(self) -> None:
-        """Skip the next counter check; during its configuration a device does not count samples."""
+        """Skip the next counter check, because a device counts no samples during configuration."""
         self._counter = None
 
     def to_ns(self, ticks: int) -> int:
@@ -160,7 +162,7 @@ class TickTime:
         self._counter = counter
         return self.to_ns(ticks)
 
-    def explain(self, ticks: int | None, counter: int | None, elapsed_ns: int) -> ClockEvent:  # noqa: ARG002 - the readers' common shape
+    def explain(self, ticks: int | None, counter: int | None, elapsed_ns: int) -> ClockEvent:  # noqa: ARG002 - signature of all readers
         """Return the event for a restart at this sample, `elapsed_ns` after the last sample."""
         before, modulus = self._last or 0, self._clock.modulus
         if modulus:
@@ -208,8 +210,8 @@ class CounterTime:
         return self._period_ns * (self._width or min(w for w in COUNTER_WIDTHS if w > self._raw))
 
     def feed(
-        self, ticks: int | None, counter: int | None, arrival_ns: int,  # noqa: ARG002 - the readers' common shape
-        envelope: MinimumDelayFilter, echo: EchoFit | None = None,  # noqa: ARG002 - the readers' common shape
+        self, ticks: int | None, counter: int | None, arrival_ns: int,  # noqa: ARG002 - signature of all readers
+        envelope: MinimumDelayFilter, echo: EchoFit | None = None,  # noqa: ARG002 - signature of all readers
     ) -> int | None:  # fmt: skip
         """Return sample number times nominal period, ns, or None for a restart."""
         if counter is None:
@@ -225,7 +227,7 @@ class CounterTime:
         self._last, self._raw, self._arrival_ns, self._backward = number, counter, arrival_ns, 0
         return number * self._period_ns
 
-    def explain(self, ticks: int | None, counter: int | None, elapsed_ns: int) -> ClockEvent:  # noqa: ARG002 - the readers' common shape
+    def explain(self, ticks: int | None, counter: int | None, elapsed_ns: int) -> ClockEvent:  # noqa: ARG002 - signature of all readers
         """Return the event for a restart at this sample, `elapsed_ns` after the last sample."""
         period = self._period_ns
         return clock_restart_event(self._raw * period, (counter or 0) * period, elapsed_ns)
@@ -272,8 +274,8 @@ class ArrivalTime:
         return None
 
     def feed(
-        self, ticks: int | None, counter: int | None, arrival_ns: int,  # noqa: ARG002 - the readers' common shape
-        envelope: MinimumDelayFilter, echo: EchoFit | None = None,  # noqa: ARG002 - the readers' common shape
+        self, ticks: int | None, counter: int | None, arrival_ns: int,  # noqa: ARG002 - signature of all readers
+        envelope: MinimumDelayFilter, echo: EchoFit | None = None,  # noqa: ARG002 - signature of all readers
     ) -> int | None:  # fmt: skip
         """Return sample number times nominal period, ns, or None for a restart."""
         number, period = self._number + 1, self._period_ns
@@ -304,7 +306,7 @@ class ArrivalTime:
         self._number, self._arrival_ns = number, arrival_ns
         return number * period
 
-    def explain(self, ticks: int | None, counter: int | None, elapsed_ns: int) -> ClockEvent:  # noqa: ARG002 - the readers' common shape
+    def explain(self, ticks: int | None, counter: int | None, elapsed_ns: int) -> ClockEvent:  # noqa: ARG002 - signature of all readers
         """Return the event for a restart at this sample, `elapsed_ns` after the last sample."""
         if elapsed_ns > _SILENCE_NS:
             return clock_event(

@@ -75,7 +75,7 @@ class DeclaredOffset(NamedTuple):
     slope: float = 0.0
 
     def usable(self, u: int) -> bool:  # noqa: ARG002 - the offset is constant
-        """Return True."""
+        """Return True, because the offset is always known."""
         return True
 
     def host_ns(self, u: int) -> int:

@@ -24,7 +24,7 @@ MEMORY_NS = 120_000_000_000
 CAPACITY = 256
 """Largest number of echoes in memory."""
 BURST = 10
-"""Number of echoes after which the fit is used."""
+"""Number of echoes of the initial burst, after which the fit is used."""
 BURST_GAP_NS = 2_000_000_000
 """Longest interval between two echoes of one burst, ns."""
 LEAST_MARGIN_NS = 50_000
@@ -89,7 +89,7 @@ class EchoFit:
         return sqrt(self._line.slope_var)
 
     def contradicts(self, u: int, sent_ns: int, received_ns: int) -> bool:
-        """Return whether an echo contradicts the fit by more than the error bound of the echo."""
+        """Return whether an echo contradicts the fit by `JUMP_NS` more than its error bound."""
         if not self.settled:
             return False
         middle = (sent_ns + received_ns) // 2
@@ -152,6 +152,6 @@ class EchoFit:
         )
 
     def sigma_ns(self, host_ns: int) -> float:
-        """Return the standard deviation at `host_ns`, ns; inf before any echo."""
+        """Return the standard deviation of ``device_ns(host_ns)``, ns; inf before any echo."""
         m = host_ns - self._ref
         return sqrt(self._line.variance_at(m))

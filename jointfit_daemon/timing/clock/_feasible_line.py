@@ -31,7 +31,7 @@ Point = tuple[int, int]
 _SUPPORTS = 2
 """Number of points at the ends of an edge of the hull."""
 _FINEST_NS = 1_000.0
-"""Least mean height of the points above the edge, ns."""
+"""Lower bound of the mean height of the points above the edge, ns."""
 _JAM_NS = 25_000_000.0
 """Height above which a point is attributed to a starved host or a full queue, ns."""
 _LEAST = 5

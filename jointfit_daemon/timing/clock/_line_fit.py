@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 _HUBER = 1.345
-"""Huber threshold in standard deviations. It has 95 % efficiency for normal errors."""
+"""Huber threshold in standard deviations. The fit is then 95 % efficient for normal errors."""
 _PASSES = 4
 """Number of iterations of the reweighted least squares."""
 

@@ -99,7 +99,7 @@ class MinimumDelayFilter:
         return self.at(u)[1]
 
     def at(self, u: int) -> tuple[int, float]:
-        """Return ``offset_ns`` and ``sigma_ns`` in one call, because it runs for every sample."""
+        """Return ``offset_ns`` and ``sigma_ns`` in one call, to save time for every sample."""
         ahead = u - self._ref
         height, both, slope = self._variance
         spread = height + ahead * (2.0 * both + ahead * slope)

@@ -75,7 +75,7 @@ class MonotonicStamps:
         target : int
             Estimated host time, ns.
         skew : float
-            Slope of host minus device time, dimensionless.
+            Derivative of host time minus device time with respect to device time, dimensionless.
         slew : bool
             Whether the rate of the correction is limited to ``SLEW``.
 

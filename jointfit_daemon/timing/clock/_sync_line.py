@@ -16,7 +16,9 @@ UNAMBIGUOUS = 0.35
 FARTHEST_NS = 20_000_000
 """Largest distance of two estimates of one edge, ns."""
 _INSTANTS = 512
-"""Largest number of reference instants in memory. Above it, the older half is dropped."""
+"""Largest number of reference instants in memory. Above this number, the older half is
+dropped.
+"""
 _WAITING = 64
 """Largest number of unmatched edges in memory for each device."""
 

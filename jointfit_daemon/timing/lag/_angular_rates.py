@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 KERNEL_HALF_S = 0.08
-"""Half length of the low-pass kernel, s. Each run loses this time at both ends."""
+"""Half length of the low-pass kernel, s. Each gapless run loses this time at both ends."""
 GAP = 1.5
 """Interval in nominal periods above which samples are missing."""
 BRIDGE_S = 0.035
@@ -50,7 +50,7 @@ class Rates:
     period_s: float
     """Median sample period, s."""
     valid_share: float
-    """Covered fraction of the track's duration."""
+    """Fraction of the track's duration that the rates cover."""
 
     def runs(self) -> list[slice]:
         """Return the gapless runs."""
@@ -163,12 +163,12 @@ class Interpolant:
                 slopes[2:-2] = (w[:-4] - w[4:] + 8.0 * (w[3:-1] - w[1:-3])) / (12.0 * h)
 
     def locate(self, t: Floats) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-        """Return the interval of each instant, and whether it is inside a run."""
+        """Return the index of the sample interval of each instant, and whether a run covers it."""
         at, inside, _, _ = self._intervals(t)
         return at, inside
 
     def _intervals(self, t: Floats) -> tuple[NDArray[np.intp], NDArray[np.bool_], Floats, Floats]:
-        """Return the interval of each instant, whether it is inside a run, and its two ends, s."""
+        """Return the results of ``locate``, and both ends of each interval, s."""
         if self._t.size < 2:  # noqa: PLR2004 - an interval has two ends
             nowhere = np.zeros(t.size)
             return (

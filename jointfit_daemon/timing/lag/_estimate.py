@@ -13,7 +13,7 @@ where g is the rate of the IMU and omega the rate from motion capture, each in i
 is the rotation, b the bias and n the noise. The lag tau is the **IMU timestamp minus the mocap
 timestamp of the same event**, so it is positive if the IMU is later. To align the systems, subtract
 the lag from the IMU timestamps. The lag contains all delays that the clocks cannot observe:
-constant transport delay, filters in both systems, and exposure conventions.
+constant transport delay, filters in both systems, and the definition of the exposure instant.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class LagEstimate:
     mean_weight: float = nan
     """Mean Huber weight of the residuals, 0 to 1."""
     valid_share: float = nan
-    """Covered fraction of the duration, of the track with more gaps."""
+    """Fraction of the duration that the rates cover, for the track with more gaps."""
     pairs: int = 0
     """Number of compared rates."""
 
@@ -105,9 +105,9 @@ def estimate_lag(
 ) -> LagEstimate:
     """Estimate the lag between two tracks of orientations.
 
-    The lag of filtered orientations differs from the lag of the gyro, because an orientation filter
-    leads its gyro by half its internal period. Each lag applies only to the quantity from which it
-    was estimated.
+    The lag of filtered orientations differs from the lag of the gyro, because the output of an
+    orientation filter leads the gyro by half the internal period of the filter. Each lag applies
+    only to the quantity from which it was estimated.
 
     Parameters
     ----------

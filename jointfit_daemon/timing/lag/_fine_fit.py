@@ -23,8 +23,8 @@ threshold suits errors that grow with the motion, where the largest residuals co
 information.
 """
 CHOICES = 6
-"""Number of first iterations that select the threshold with the least lag variance. The later
-iterations use the last selected threshold."""
+"""Number of initial iterations, each of which selects the threshold with the least lag variance.
+The later iterations use the last selected threshold."""
 MEDIAN_NORM = 1.538
 """Median norm of a standard normal vector of three components."""
 STEP_S = 0.020
@@ -198,7 +198,7 @@ def _scale(norm: Floats) -> float:
 
 
 def _huber_weights(norm: Floats, clip: float) -> Floats:
-    """Return the Huber weights."""
+    """Return the Huber weight of each norm, with the threshold `clip`."""
     return np.minimum(1.0, clip / np.maximum(norm, _TINY))
 
 

@@ -55,8 +55,8 @@ class LagSettings:
     min_acceleration: float = radians(300.0)
     """Least RMS angular acceleration of the reference, rad/s²."""
     max_sigma_ns: float = 700_000.0
-    """Largest standard deviation, ns. The threshold is well above the standard deviation of
-    ordinary motion, so that windows are not selected by chance.
+    """Largest standard deviation, ns. Ordinary motion determines the lag with a much smaller
+    standard deviation, so windows are not selected by chance.
     """
     min_r2: float = 0.98
     """Least R². Correct data on one rigid body reach 0.998; sensors on soft tissue reach less."""

@@ -1,8 +1,8 @@
 r"""Standard deviation of a fitted lag, without assumptions about the residuals.
 
-Residuals of low-pass filtered rates are correlated over the filter length. Where the two bodies or
-systems disagree (soft tissue, lens, gyro scale), they are correlated over whole movements. The
-variance is therefore estimated in several ways, and the largest is used:
+Residuals of low-pass filtered rates are correlated over the filter length. Errors of soft tissue,
+lens or gyro scale correlate the residuals over whole movements. The variance is therefore estimated
+in several ways, and the largest estimate is used:
 
 * the delete-a-block jackknife (Tukey; Künsch 1989): the lag is computed without each block of the
 window in turn. The window has at most 20 blocks, none shorter than the filter. The computation is
@@ -12,10 +12,11 @@ jackknife needs no model of the residuals. It detects a single block that determ
 blocks.
 
 A variance from few blocks is uncertain itself. :math:`\nu + 1 = (\sum h)^2/\sum h^2` is the
-effective number of blocks that carry the information h about the lag. The finest scale is widened
-by the ratio of the Student t quantile with :math:`\nu` degrees of freedom to the normal quantile of
-equal probability. Coarser scales only detect long correlations, and are not widened. If the window
-contains a single tap and otherwise rest, the result is infinite.
+effective number of blocks that carry the information h about the lag. The standard deviation of the
+finest scale is multiplied by the ratio of the Student t quantile with :math:`\nu` degrees of
+freedom to the normal quantile of equal probability. The other scales only detect long correlations,
+and are not corrected. If the window contains a single tap and otherwise rest, the result is
+infinite.
 
 If all samples with information about the lag have the same timestamp error, the residuals do not
 show this error. Devices sample on ticks of an internal clock. The rounding error of the timestamps
@@ -55,7 +56,7 @@ MOST_BLOCKS = 20
 whose rate is anticorrelated over short times.
 """
 SIGMAS = 2.8
-"""Normal quantile at which the tail probabilities are matched."""
+"""Normal quantile whose tail probability the Student t quantile matches."""
 STAMP_PERIODS_S = (1.95, 3.9)
 """Periods of the sawtooth error of the timestamps, s; the larger variance is used.
 
@@ -87,7 +88,7 @@ class LinearizedLag(NamedTuple):
     rate: Floats
     """Rate of the slower track, rad/s, shape (n, 3)."""
     t_s: Floats
-    """Instants, rising, s, shape (n,)."""
+    """Instants in ascending order, s, shape (n,)."""
 
 
 def lag_sigma(solved: LinearizedLag, memory_s: float, stamp_sd_s: float = 0.0) -> float:
@@ -175,7 +176,7 @@ def _widest(table: Floats, block: NDArray[np.int64], whole: Floats, free: float)
 
 
 def _newey_west(score: Floats, lags: int) -> float:
-    """Return the variance of the sum of `score`, correlated over `lags` samples."""
+    """Return the variance of the sum of `score`, with correlations over `lags` samples."""
     variance = float(score @ score)
     for lag in range(1, min(lags, len(score) - 1) + 1):
         variance += 2.0 * (1.0 - lag / (lags + 1)) * float(score[lag:] @ score[:-lag])

@@ -1,8 +1,8 @@
 r"""Running lag estimate from many windows, with detection of steps.
 
 A Kalman filter estimates the lag and its drift, :math:`(\tau, \dot\tau)`, with one update per
-window. With both clocks mapped to host time the lag is constant, so the drift is small by
-assumption. A step indicates that a device restarted or changed a filter.
+window. If both clocks are mapped to host time, the lag is nearly constant, so the filter assumes a
+small drift. A step indicates that a device restarted or changed a filter.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.lag._estimate import LagEstimate
 
 DRIFT_NOISE = 0.02e-6
-"""Random walk of the drift, 1/sqrt(s)."""
+"""Standard deviation of the random walk of the drift per square root of the time, 1/sqrt(s)."""
 DRIFT_SD = 5e-6
 """Prior standard deviation of the drift of two mapped clocks, dimensionless."""
 GATE_SIGMAS = 4.0
@@ -23,7 +23,7 @@ GATE_SIGMAS = 4.0
 `LagSettings` contains the thresholds for a single window.
 """
 STEP_WINDOWS = 3
-"""Number of successive windows beyond `GATE_SIGMAS`, with consistent lags, that are a step."""
+"""Number of successive windows beyond `GATE_SIGMAS`, with consistent lags, that count as a step."""
 AGREE_NS = 500_000.0
 """Largest range of consistent lags, ns."""
 

@@ -1,4 +1,4 @@
-"""Log lines on MQTT: a thread that logs without pause costs the event loop nothing."""
+"""Log lines on MQTT: a thread that logs without pause does not load the event loop."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ def test_device_name_cannot_forge_a_log_line(formatter: logging.Formatter) -> No
 
 
 class _Outbox:
-    """Keeps what is published."""
+    """An outbox that stores all messages."""
 
     def __init__(self) -> None:
         self.payloads: list[bytes] = []

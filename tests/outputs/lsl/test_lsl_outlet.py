@@ -41,7 +41,7 @@ def frame(number: int, t_ns: int, *, known: bool = True) -> LimbState:
 
 
 class Received(NamedTuple):
-    """What the receiver got; no object of the library, so that its sockets are closed."""
+    """Received data, without an object of the library, so that its sockets are closed."""
 
     rate_hz: float
     labels: list[str]

@@ -178,7 +178,7 @@ async def test_the_histogram_counts_each_frame_once_in_its_bucket(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     frames, now_ns = FrameStatistics(), 10**9 * 3600
-    clock = SimpleNamespace(monotonic_ns=lambda: now_ns)  # a pause would change the bucket
+    clock = SimpleNamespace(monotonic_ns=lambda: now_ns)  # fixed, as a pause changes the bucket
     monkeypatch.setattr("jointfit_daemon.outputs.metrics._frame_statistics.time", clock)
     for latency_ms in (0, 7, 7, 2000):
         frames.output(FRAME._replace(completed_ns=now_ns - latency_ms * 1_000_000))

@@ -137,7 +137,7 @@ async def test_stored_state_of_a_dead_daemon_does_not_stop_a_new_one(
 
 @pytest.fixture
 def unseen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make the daemons not detect each other before connecting, as if both started together."""
+    """Prevent the daemons from detecting each other before they connect, as after a joint start."""
 
     async def is_in_use(settings: MqttSettings, offline: bytes) -> bool:
         del settings, offline
@@ -227,8 +227,8 @@ def test_one_short_connection_raises_suspicion_only_with_a_reason() -> None:
 def takeovers(first: TakeoverDetector, gap_s: float, handshake_s: float, reason: bool) -> list[int]:
     """Return which of two daemons lost each connection, until one of them waits.
 
-    Daemon 1 connects `gap_s` after daemon 0. A wait of the publisher follows each loss. It is 0.05
-    s, doubled up to 0.6 s, of which a random part of at least one half is used.
+    Daemon 1 connects `gap_s` after daemon 0. The publisher waits after each loss, for a random time
+    between half of a limit and this limit. The limit is 0.05 s at first and doubles up to 0.6 s.
     """
     waits = random.Random(1)
     detectors, delays_s, lost = (first, TakeoverDetector()), [0.05, 0.05], []

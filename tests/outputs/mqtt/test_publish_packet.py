@@ -1,4 +1,4 @@
-"""Messages at QoS 0 on their short way to the socket: their bytes, and a socket that is full."""
+"""Messages at QoS 0 that are written directly to the socket: bytes, and a full socket."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _Properties: Any = Properties  # the constructor is not annotated
 CONNACK = b"\x20\x03\x00\x00\x00"
 LARGE = 200_000
-"""More bytes than the socket buffers take together."""
+"""Number of bytes that exceeds all socket buffers together."""
 
 
 class PacketCollector(Client):
@@ -65,7 +65,7 @@ def test_packets_are_those_of_the_library(
 
 
 class SlowReader:
-    """A broker that accepts a connection and reads what follows only when asked to."""
+    """A broker that accepts a connection, and reads further data on request only."""
 
     def __init__(self) -> None:
         self.received = bytearray()
@@ -106,7 +106,7 @@ async def test_messages_keep_their_order_and_bytes_when_the_socket_is_full() -> 
         for number, payload in enumerate(payloads):
             message = Outgoing("b/pose", payload, expiry_s=2)
             await connection.send(message, lambda _, number=number: accepted.append(number))  # type: ignore[misc]
-        assert accepted == [0]  # the second did not fit, and all others wait behind it
+        assert accepted == [0]  # the second did not fit, and all others wait
 
         await broker.read_up_to(payloads[-1])
     found, at = [], broker.received.index(b"b/pose") - 5

@@ -45,7 +45,7 @@ request_key_file = "key"
 
 @pytest.fixture
 def broker(tmp_path: Path, start_mosquitto: Callable[[str], Broker]) -> Broker:
-    """Return a broker that lets nobody in without the password."""
+    """Return a broker that accepts clients with the password only."""
     program = shutil.which("mosquitto_passwd", path=MosquittoBroker.PATH)
     if program is None:
         pytest.skip(MOSQUITTO_MISSING)
@@ -67,7 +67,7 @@ def folder(tmp_path: Path, broker: Broker) -> Path:
 
 
 async def everything_published(broker: Broker, folder: Path) -> bytes:
-    """Return all topics and payloads of the first second, having asked for something, too."""
+    """Return all topics and payloads until a health message, a request, and its answer."""
     settings = MqttSettings(
         host="127.0.0.1", port=broker.port, base="jointfit/bench", username="jointfitd",
         password_file=str(folder / "password"), request_key_file=str(folder / "key"),
@@ -109,13 +109,13 @@ def daemon(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def seen_from_outside(process: subprocess.Popen[bytes]) -> bytes:
-    """Return arguments and environment."""
+    """Return arguments and environment of the process."""
     inside = Path("/proc") / str(process.pid)
     return (inside / "cmdline").read_bytes() + (inside / "environ").read_bytes()
 
 
 def stopped(process: subprocess.Popen[bytes]) -> bytes:
-    """Stop the process and return what it said."""
+    """Stop the process and return its output."""
     process.terminate()
     said, _ = process.communicate(timeout=10)
     assert process.returncode == 0
@@ -172,7 +172,7 @@ def test_world_readable_secret_is_reported(tmp_path: Path) -> None:
 async def test_plain_mqtt_to_another_machine_is_logged_at_every_start(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    assert security_warnings(MqttSettings(insecure=True)) == []  # on this machine nobody listens in
+    assert security_warnings(MqttSettings(insecure=True)) == []  # on the same machine
     settings = MqttSettings(host="broker.invalid", insecure=True, base="b")
     with caplog.at_level(logging.WARNING):
         link = asyncio.create_task(MqttPublisher(settings, Outbox("b/s"), lambda _: None).run())

@@ -81,7 +81,7 @@ def settings(broker: Broker, host: str = "127.0.0.1", **tls: Any) -> MqttSetting
 
 
 async def said(settings: MqttSettings) -> str:
-    """Return why the connection cannot be made."""
+    """Return the error text of a connection that fails."""
     with pytest.raises(BrokerLostError) as lost:
         async with MqttConnection(settings):
             pass

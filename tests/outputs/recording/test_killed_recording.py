@@ -38,7 +38,7 @@ class KilledRecording(NamedTuple):
     messages: int
     gaps: int
     late_s: float
-    """Longest time between two chunks: what the load of the machine adds to the loss."""
+    """Longest time between two chunks, by which the load of the machine increases the loss."""
 
 
 def kill_one(folder: Path, after_s: float) -> KilledRecording:

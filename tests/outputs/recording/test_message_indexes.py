@@ -30,13 +30,13 @@ PREFIX_BYTES = 9
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a recording of several chunks: one message each nanosecond, of the sensors in turn."""
+    """Return a recording with several chunks: one message per nanosecond, sensors in turn."""
     events = [ChunkArrived(f"S{t_ns % SENSORS}", Chunk(t_ns, bytes(20))) for t_ns in range(LAST_NS)]
     return write_recording(tmp_path_factory.mktemp("recordings"), events)
 
 
 def read_by_indexes(path: Path, topic: str, start_ns: int, end_ns: int) -> list[Message]:
-    """Return messages as Foxglove and PlotJuggler do: by their places in the message indexes."""
+    """Return messages by their positions in the message indexes, like Foxglove and PlotJuggler."""
     found = []
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()

@@ -1,4 +1,4 @@
-"""Any sequence of starts, stops, full disks and kills leaves a recorder that records again."""
+"""After any sequence of starts, stops, full disks and kills, the recorder can record again."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ if TYPE_CHECKING:
 
 LIMITS = RecordingLimits(file_bytes=20_000)
 MOST_WAITING = 40
-"""Events that wait for a slow disk."""
+"""Largest number of events that wait for a slow disk."""
 
 
 class RecordingMachine(RuleBasedStateMachine):
-    """A recorder, its disk, and the events that it was given while it was active."""
+    """A recorder, its disk, and the events that it received while it was active."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -55,7 +55,7 @@ class RecordingMachine(RuleBasedStateMachine):
         self.loop = asyncio.new_event_loop()
         self.number = self.killed = 0
         self.expected: list[int] = []
-        """Numbers of the events that were given to the active recorder."""
+        """Numbers of the events that the active recorder received."""
         self.unsafe: list[int] = []
         """Numbers of the events since the last write, which a kill loses."""
         self.recorder = self.new_recorder(autostart=False)
@@ -65,7 +65,7 @@ class RecordingMachine(RuleBasedStateMachine):
         return Recorder(self.folder, "rig", LIMITS, autostart=autostart)
 
     def new_writer(self, *arguments: Any) -> SessionWriter:
-        """Return the writer of a session, and remember it for its losses."""
+        """Return the writer of a session, and store it, because it counts losses."""
         self.writers.append(SessionWriter(*arguments))
         return self.writers[-1]
 
@@ -105,7 +105,7 @@ class RecordingMachine(RuleBasedStateMachine):
         self.check_start(self.complete(outcome(self.recorder.start())))
 
     def check_start(self, found: object) -> None:
-        """A start is refused, or records."""
+        """Check that a start was refused because of the disk, or that the recorder records."""
         if isinstance(found, OSError):
             assert self.room_bytes < float("inf"), "refused although the disk has room"
             assert not self.recorder.health().active
@@ -139,7 +139,7 @@ class RecordingMachine(RuleBasedStateMachine):
             return await asyncio.gather(*(outcome(call()) for call in calls))
 
         answers = dict(zip(order, self.complete(all_at_once()), strict=True))
-        if order.index("stop") < order.index("start"):  # the last of the equal names is kept
+        if order.index("stop") < order.index("start"):  # of two equal names, the last counts
             started = not isinstance(answers["start"], OSError)
             assert self.recorder.health().active == started
         self.unsafe = []
@@ -198,7 +198,7 @@ class RecordingMachine(RuleBasedStateMachine):
 
 
 async def outcome(work: Any) -> Any:
-    """Return the result of `work`, or its error of the disk."""
+    """Return the result of `work`, or the error of the disk."""
     try:
         return await work
     except OSError as error:

@@ -41,7 +41,7 @@ class FakeLink:
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Write and poll often."""
+    """Shorten the intervals of writing and polling."""
     for name, seconds in (("WRITE_S", 0.01), ("_POLL_S", 0.002), ("START_S", 0.05)):
         monkeypatch.setattr(_spool, name, seconds)
     monkeypatch.setattr(_spool, "SUBSCRIBE_S", 0.02)

@@ -100,7 +100,7 @@ def test_random_bytes_are_no_message(data: bytes) -> None:
     assert found is None or _line(found) == data
 
 
-def test_what_a_full_disk_does_not_take_leaves_no_part(
+def test_a_message_that_a_full_disk_rejects_leaves_no_part(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     files, write = SpoolFiles(tmp_path, 100_000), os.write

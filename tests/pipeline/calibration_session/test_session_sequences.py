@@ -1,4 +1,4 @@
-"""Any sequence of requests, faults, fits and reloads leaves a session that can calibrate."""
+"""After any sequence of requests, faults, fits and reloads, the session can calibrate."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ class SessionMachine(RuleBasedStateMachine):
         return reply
 
     def state(self) -> tuple[object, ...]:
-        """Return the state that a request could change."""
+        """Return the state that a refused request must not change."""
         one = self.session
         refits = (one.refits.paused, one.refits.job, one.refits.original)
         return one.phase, one.calibration, one.version, one.collecting, one._done, refits

@@ -1,4 +1,4 @@
-"""Chunks that a recording which starts later needs, so that new decoders understand the data."""
+"""Chunks that describe a source; a recording that starts later needs them to decode the data."""
 
 from __future__ import annotations
 

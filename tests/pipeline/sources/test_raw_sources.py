@@ -50,7 +50,7 @@ def test_mixed_heading_references_give_a_warning_at_the_start() -> None:
     outputs = Core().feed(Configured(1, mixed, None))
     told = [out for out in outputs if isinstance(out, Notice) and out.level == "warning"]
     assert len(told) == 1
-    assert "by magnetometer on S1, but not on S3" in told[0].text
+    assert "magnetometer used for S1, but not for S3" in told[0].text
 
 
 def test_health_of_a_raw_source_contains_rest_and_bias() -> None:

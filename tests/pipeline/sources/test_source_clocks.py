@@ -27,7 +27,7 @@ UNIT = (1.0, 0.0, 0.0, 0.0)
 
 @dataclass
 class Spoken:
-    """A decoder that returns prepared items: the chunk's bytes are their index."""
+    """A decoder that returns prepared items; the bytes of a chunk are the index of its items."""
 
     items: list[list[Decoded]] = field(default_factory=list)
     tick_clock: TickClock | None = OWN
@@ -42,7 +42,7 @@ class Spoken:
 
 
 class SourceClockRig:
-    """A core with two sensors whose decoders are given words."""
+    """A core with two sensors whose decoders return prepared items."""
 
     def __init__(self) -> None:
         table = {

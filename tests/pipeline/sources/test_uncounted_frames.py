@@ -37,7 +37,7 @@ T0_US = 1_700_000_000_000_000
 
 @given(st.lists(st.integers(0, 3), min_size=1, max_size=20))
 def test_frames_stamped_in_bursts_have_one_clock(bursts: list[int]) -> None:
-    """VRPN stamps a report when it is made: a stalled server makes several at once."""
+    """VRPN stamps a report when the server creates it; a stalled server creates several at once."""
     rig = parse_rig(tomllib.loads(RIG + CAMERAS))
     state = SourceState.create(next(s for s in rig.sources if s.kind == "mocap"))
     state.start()

@@ -1,4 +1,4 @@
-"""Frames on a fixed grid from streams that are late, lossy, fast, slow, restarting or dead."""
+"""Frames at fixed times from streams that are late, lossy, fast, slow, restarting or silent."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def stream(
 
 
 def play(aligner: FrameAligner, pushes: list[Push]) -> list[AlignedFrame]:
-    """Push in order of arrival and wake at every deadline, as the daemon does."""
+    """Push samples in order of arrival, and advance at every deadline, as the daemon does."""
     frames: list[AlignedFrame] = []
     for arrival, name, t in sorted(pushes):
         while (deadline := aligner.next_deadline_ns) is not None and deadline < arrival:
@@ -100,7 +100,7 @@ def test_missing_samples_delay_a_frame_by_one_and_a_half_periods_at_most(
     assert 5 * MS < max(delays) <= 15 * MS
 
 
-def test_a_sample_period_that_is_not_quite_nominal_keeps_that_bound() -> None:
+def test_missing_samples_delay_a_frame_by_the_same_bound_if_the_period_is_not_nominal() -> None:
     period = 10_200_000
     lost = [first + more for first in range(20, 300, 7) for more in range(3)]
     for phase in range(0, 10 * MS, 900_000):
@@ -263,7 +263,7 @@ def test_no_frame_comes_before_its_instant_when_all_streams_end() -> None:
         assert all(f.t_ns <= f.completed_ns <= now_ns for f in a.advance(now_ns))
 
 
-def test_frames_owed_for_long_are_passed_over() -> None:
+def test_frames_that_are_overdue_for_long_are_skipped() -> None:
     a = aligner(A=10 * MS)
     month = 30 * 86_400_000 * MS
     for k in range(50):

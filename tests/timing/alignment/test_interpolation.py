@@ -1,4 +1,4 @@
-"""Between and beyond samples: exact where it must be, and closer to fast motion than a slerp."""
+"""Interpolation and extrapolation: exact at constant rate, better than slerp in fast motion."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def quaternion(turn: Rotation) -> Quaternion:
 
 
 def shaken() -> Callable[[float], tuple[Quaternion, Vector]]:
-    """A smooth motion about all axes, up to 20 rad/s, from an independent spline."""
+    """Return a function of a smooth motion about all axes, up to 20 rad/s, from SciPy's spline."""
     t = np.arange(0.0, 2.0, 0.02)
     turns = np.stack([np.sin(14 * t), 0.8 * np.sin(11 * t + 1), 0.6 * np.cos(17 * t)], axis=1)
     spline = RotationSpline(t, Rotation.from_rotvec(turns))
@@ -83,14 +83,14 @@ def errors(found: Callable[[int, int], Quaternion]) -> float:
 
 
 def test_the_spline_yields_body_rates_in_the_own_frame() -> None:
-    """The oracle's own convention, by its difference quotient."""
+    """The convention of SciPy's rates is checked by a difference quotient."""
     q0, w = MOTION(0.7)
     q1, _ = MOTION(0.7 + 1e-6)
     turn = Rotation.from_quat([*q0[1:], q0[0]]).inv() * Rotation.from_quat([*q1[1:], q1[0]])
     assert turn.as_rotvec() / 1e-6 == pytest.approx(w, abs=1e-3)
 
 
-def test_fast_motion_is_met_better_with_a_third_sample_and_best_with_rates() -> None:
+def test_a_third_sample_reduces_the_error_in_fast_motion_and_rates_reduce_it_further() -> None:
     def slerp(t: int, x: int) -> Quaternion:
         return interpolate_one(sample(t).q, sample(t + STEP).q, x / STEP)
 
@@ -107,7 +107,7 @@ def test_fast_motion_is_met_better_with_a_third_sample_and_best_with_rates() -> 
     assert errors(cubic) < 0.01
 
 
-def test_a_bend_and_rates_both_shorten_the_error_of_an_extrapolation() -> None:
+def test_curvature_and_rates_both_reduce_the_error_of_an_extrapolation() -> None:
     def straight(t: int, x: int) -> Quaternion:
         return extrapolate_orientation(None, sample(t - STEP), sample(t), t + x)
 
@@ -145,7 +145,7 @@ def test_samples_are_reproduced_for_any_quaternion_sign(
 
 
 @given(st.floats(-20, 20), st.integers(0, 25 * MS), st.booleans())
-def test_a_constant_rate_is_met_exactly(speed: float, x: int, known: bool) -> None:
+def test_a_constant_rate_is_reproduced_exactly(speed: float, x: int, known: bool) -> None:
     def at(t: int) -> Sample:
         half = speed * t * 1e-9 / 2
         rate = (speed, 0.0, 0.0) if known else None
@@ -159,7 +159,7 @@ def test_a_constant_rate_is_met_exactly(speed: float, x: int, known: bool) -> No
 
 
 def test_rates_that_contradict_the_orientations_are_not_used() -> None:
-    """Degrees for radians, other axes, another sign: then the samples have to do."""
+    """Rates in degrees, about other axes or with another sign are not used."""
     a, b, before = sample(0), sample(STEP), sample(-STEP)
     plain, beyond_plain = (
         interpolate_orientation(before, a, b, 4 * MS),
@@ -173,8 +173,8 @@ def test_rates_that_contradict_the_orientations_are_not_used() -> None:
         assert extrapolate_orientation(None, before, a, 4 * MS) == beyond_plain
 
 
-def test_a_bend_does_not_grow_beyond_one_interval() -> None:
-    """Two periods on, a parabola would have turned twice as far as the last rate says."""
+def test_curvature_is_extrapolated_for_one_interval_only() -> None:
+    """A parabola would overshoot after two periods, so the curvature applies to one period only."""
     earlier, before, a = (Sample(k * STEP, turned(x)) for k, x in ((-2, 0.0), (-1, 0.1), (0, 0.3)))
     assert (
         angle_between_one(extrapolate_orientation(earlier, before, a, STEP), turned(0.3 + 0.25))
@@ -194,7 +194,7 @@ def turned(angle: float) -> Quaternion:
 
 @pytest.mark.experiment
 def test_mean_rates_are_worse_than_no_rates() -> None:
-    """Why a driver must leave such rates out (``ImuSample.rate``)."""
+    """A driver must therefore omit mean rates (``ImuSample.rate``)."""
 
     def mean(number: int) -> Sample:
         q, before = MOTION(0.5 + number * STEP * 1e-9)[0], MOTION(0.5 + (number - 1) * STEP * 1e-9)

@@ -12,12 +12,13 @@ S = 1_000_000_000
 @pytest.mark.parametrize(
     ("times_ns", "kind", "text", "jump_ms"),
     [
-        ((100 * S, S, 3 * S), "restart", "device rebooted: its clock restarted at 1.00 s after 100",
+        ((100 * S, S, 3 * S), "restart", "device rebooted: its clock went back from 100.00 s to 1",
          -102_000.0),
-        ((100 * S, 5 * S, 3 * S), "restart", "device rebooted: its clock restarted at 5.00 s after",
-         -98_000.0),
+        ((100 * S, 5 * S, 3 * S), "restart",
+         "device rebooted: its clock went back from 100.00 s to 5.00 s", -98_000.0),
         ((100 * S, 5 * S + 1, 3 * S), "clock", "device clock jumped back by 98000.0 ms", -98_000.0),
-        ((100 * S, 0, 0), "restart", "device rebooted: its clock restarted at 0.00 s", -100_000.0),
+        ((100 * S, 0, 0), "restart", "device rebooted: its clock went back from 100.00 s to 0.00 s",
+         -100_000.0),
         ((S, S, S), "clock", "device clock jumped back by 1000.0 ms", -1000.0),
         ((S, 4 * S, S), "clock", "device clock jumped ahead by 2000.0 ms", 2000.0),
         ((S, -1, S), "clock", "device clock jumped back by 2000.0 ms", -2000.0),

@@ -25,7 +25,7 @@ HEALED_NS = 5 * S
 
 
 def longest_run_back(stamps: list[int]) -> int:
-    """Return the most stamps in a row that are not later than one before: called reordered."""
+    """Return the largest number of successive stamps that are not later than the newest one."""
     newest, now, most = -1, 0, 0
     for t in stamps:
         now = now + 1 if t <= newest else 0
@@ -34,16 +34,16 @@ def longest_run_back(stamps: list[int]) -> int:
 
 
 class ClockFaultRun:
-    """A device whose clock and host may be tampered with while it streams."""
+    """A streaming device; a test can change its clock, its counter and the host's clock."""
 
     def __init__(self, seed: int = 0) -> None:
         self.clock = DeviceClock(PERIOD)
         self.rng = np.random.default_rng(seed)
         self.k = 0
         self.ahead_ns = 60 * S
-        """Device time beyond the time since the start."""
+        """Device time minus the time since the start, ns."""
         self.asleep_ns = 0
-        """What the host's clock missed."""
+        """Time during which the host's clock stood still, ns."""
         self.counter = 100
         self.out: list[tuple[int, Stamp]] = []
 
@@ -59,7 +59,7 @@ class ClockFaultRun:
             self.counter += 1
 
     def check(self, since: int, news: str) -> None:
-        """Time never ran backwards; from 5 s after sample `since` on it is right again."""
+        """Check that stamps never decrease, are correct 5 s after sample `since`, and the news."""
         assert longest_run_back([stamp.t_ns for _, stamp in self.out]) < BACKWARD_LIMIT
         for number, (true, stamp) in enumerate(self.out):
             healed = number >= since + HEALED_NS // PERIOD
@@ -71,7 +71,7 @@ class ClockFaultRun:
 
 
 @pytest.mark.parametrize("jump_ms", [-30_000, -3_000, -400, 40, 3_000, 100_000])
-def test_a_clock_that_jumps_while_samples_go_on(jump_ms: int) -> None:
+def test_a_clock_jump_is_reported_and_stamps_recover(jump_ms: int) -> None:
     run = ClockFaultRun()
     run.stream(12)
     run.ahead_ns += jump_ms * MS
@@ -91,7 +91,7 @@ def test_a_reboot_within_a_stream_is_reported_as_restart(counted: bool) -> None:
     assert run.clock.news[0].kind == "restart"
 
 
-def test_a_host_that_slept_while_the_device_ran_on() -> None:
+def test_suspend_of_the_host_is_reported_and_stamps_recover() -> None:
     run = ClockFaultRun()
     run.stream(12)
     asleep_s = 40
@@ -175,7 +175,7 @@ def test_stamps_are_monotonic_and_recover_from_any_clock_fault(
 
 
 def test_ten_hours_need_constant_memory() -> None:
-    """Containers are as big after ten hours as after two minutes; one sample a second is enough."""
+    """Containers have the same size after ten hours as after two minutes, at 1 sample/s."""
     clock, server = DeviceClock(S), TickClock(1000, 1 << 32)
     sizes = []
     for k in range(36_000):

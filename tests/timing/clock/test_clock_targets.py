@@ -14,11 +14,11 @@ if TYPE_CHECKING:
 
 NOWHERE = Path()
 SLACK = 1.5
-"""Of a few runs the 99th percentile is the worst, and the root mean square scatters."""
+"""Factor for thresholds. With few runs, the 99th percentile is the maximum, and the RMS varies."""
 
 
 def kept(figure: Result) -> bool:
-    """Tell whether a figure of fewer runs is what the goal of more runs makes likely."""
+    """Return whether a result of few runs is within the enlarged threshold."""
     return figure.value <= SLACK * figure.maximum
 
 
@@ -39,4 +39,4 @@ def test_clocks_keep_their_targets(figures: clocks.Figures) -> None:
 @pytest.mark.alone
 def test_an_update_costs_microseconds() -> None:
     (figure,) = clocks.cost(NOWHERE)
-    assert figure.value <= 5 * figure.maximum  # a busy machine of any kind; the bench says how many
+    assert figure.value <= 5 * figure.maximum  # the machine may be busy; bench has the exact limit

@@ -1,4 +1,4 @@
-"""The last minute of delays against numpy."""
+"""Statistics of the delays of the last minute, compared with NumPy."""
 
 from __future__ import annotations
 

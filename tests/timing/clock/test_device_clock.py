@@ -136,7 +136,7 @@ def test_a_better_estimate_is_slewed_to_and_sigma_contains_the_difference() -> N
     assert stamps[1005].sigma_ns > 2.5 * MS
 
 
-def test_sigma_is_honest() -> None:
+def test_errors_are_consistent_with_sigma() -> None:
     for seed in range(6):
         errors, stamps = errors_of(DeviceClock(PERIOD), Device(seed).samples(12, latency_timer))
         assert all(

@@ -1,4 +1,4 @@
-"""Sync edges and declared clocks beat the statistics, and are doubted when they contradict them."""
+"""Sync edges and declared clocks replace the arrival statistics, unless both contradict."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ IMU = 10 * MS
 
 
 class Wired:
-    """A camera server that answers echoes, and an IMU whose line gets an edge at every exposure."""
+    """A camera server that answers echoes, and an IMU that receives an edge at every exposure."""
 
     def __init__(self, seed: int = 0, *, least_delay_ms: float = 2.2, off_line_ns: int = 0) -> None:
         self.rng = np.random.default_rng(seed)
@@ -36,7 +36,7 @@ class Wired:
         self.least = round(least_delay_ms * MS)
         self.off_line = off_line_ns
         self.stamps: list[tuple[int, Stamp]] = []
-        """True instant and stamp, of IMU samples."""
+        """True instant and stamp of the IMU samples, ns."""
         self.frames: list[tuple[int, Stamp]] = []
 
     def camera_ticks(self, t: int) -> int:
@@ -93,16 +93,16 @@ class Wired:
         return np.array([stamp.t_ns - t for t, stamp in self.frames[-last:]]) / 1e3
 
 
-def test_edges_take_the_smallest_delay_out_and_leave_microseconds() -> None:
+def test_edges_remove_the_smallest_delay_to_a_few_microseconds() -> None:
     wired = Wired(least_delay_ms=2.2)
     wired.run(20.0, pulses=False)
     assert wired.imu.state == "passive"
-    assert np.mean(wired.imu_errors_us(100)) == pytest.approx(1200, abs=30)  # nobody can see it
+    assert np.mean(wired.imu_errors_us(100)) == pytest.approx(1200, abs=30)  # unobservable
     wired.run(20.0, begin=20.0)
     assert wired.imu.state == "direct"
     assert wired.imu.epoch == 0
     between = np.mean(wired.imu_errors_us(100)) - np.mean(wired.frame_errors_us(100))
-    assert abs(between) < 3.0  # of the two streams, whatever the echoes leave
+    assert abs(between) < 3.0  # difference of both streams, without the error of the echoes
     assert wired.stamps[-1][1].sigma_ns < 30_000
 
 
@@ -168,7 +168,7 @@ def test_a_declared_clock_that_arrivals_contradict_is_an_event_and_not_used() ->
     host = TickClock(1, None, None, "monotonic")
     for k in range(600):
         t = START + k * IMU
-        clock.feed_sample(t - 40 * MS, None, t + MS, host)  # 40 ms behind what it is said to be
+        clock.feed_sample(t - 40 * MS, None, t + MS, host)  # 40 ms behind the declared clock
     assert clock.state == "passive"
     assert [news.kind for news in clock.news] == ["warning", "clock"]
     assert "sync time differs" in clock.news[0].text
@@ -192,6 +192,6 @@ def test_sigma_of_a_sync_fit_contains_the_quantization_of_the_ticks(grain_ns: fl
     fit, edges = SyncEdgeFit(HostClock(), grain_ns), 9
     for k in range(edges):
         fit.feed(k * S, START + k * S)
-    middle = edges // 2 * S  # there, the slope does not contribute
+    middle = edges // 2 * S  # in the middle, the slope does not contribute
     expected = np.sqrt((EDGE_SD_NS**2 + grain_ns**2 / 12) / edges)
     assert fit.sigma_at(middle) == pytest.approx(expected, rel=1e-6)

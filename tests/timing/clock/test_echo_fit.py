@@ -26,7 +26,11 @@ SERVER = TickClock(1, None, SERVER_HZ)
 
 
 class Lan:
-    """Round trips of 0.86 ms and exponential 0.1 ms each way, 1 % spikes of 20 ms; skew 42 ppm."""
+    """A server with a skew of 42 ppm, and echoes over a network with varying delays.
+
+    The delay in each direction is 0.43 ms, plus an exponential delay with a mean of 0.1 ms, plus
+    20 ms in 1 % of the cases.
+    """
 
     def __init__(self, seed: int) -> None:
         self.rng = np.random.default_rng(seed)
@@ -40,7 +44,7 @@ class Lan:
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_echoes_map_the_server_at_once_and_better_later(seed: int) -> None:
+def test_echoes_synchronize_the_server_at_once_and_better_later(seed: int) -> None:
     lan, clock = Lan(seed), DeviceClock(PERIOD)
     now, stamp = START, NO_STAMP
     for number in range(70):
@@ -96,7 +100,7 @@ def test_single_forged_echoes_do_not_change_the_clock(forged: int) -> None:
     assert attacked.host_ns(START) == clean.host_ns(START)
 
 
-def test_echoes_before_anyone_knows_the_tick_rate_are_ignored() -> None:
+def test_echoes_before_the_tick_rate_is_known_are_ignored() -> None:
     clock = DeviceClock(PERIOD)
     clock.feed_echo(ClockEcho(START, START + MS, 5))
     assert clock.bound_ns is None
@@ -113,7 +117,7 @@ def test_a_clock_without_fresh_echoes_is_stale() -> None:
 
 @pytest.fixture
 def capture(shared_data: Path) -> list[tuple[int, bytes]]:
-    """UDP payloads to or from the NatNet server with their packet times, ns."""
+    """Return UDP payloads to and from the NatNet server with their packet times, ns."""
     file = shared_data / "mocap" / "natnet_v3_mje-nz" / "test_data" / "raw" / "traffic.pcapng"
     data, at, packets = file.read_bytes(), 0, []
     while at < len(data):
@@ -139,7 +143,7 @@ def test_the_real_capture_gives_its_known_timing(capture: list[tuple[int, bytes]
     for echo in echoes:
         clock.feed_echo(echo, SERVER)
     assert len(echoes) == 9
-    clock.feed_echo(echoes[-1], SERVER)  # the tenth completes the burst
+    clock.feed_echo(echoes[-1], SERVER)  # a tenth echo completes the burst
     for t, payload in capture:
         if struct.unpack_from("<H", payload)[0] == 7:
             (number,) = struct.unpack_from("<i", payload, 4)

@@ -1,4 +1,4 @@
-"""A starved host reads late and in bursts: late data, never a clock that restarted."""
+"""A host without CPU time reads late and in bursts; this is no restart of a device clock."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ PERIOD = 10 * MS
 START = 7_000 * S
 OWN = TickClock(1000, 1 << 32)
 SETTLING_S = 8.0
-"""Of a clock that is starved from its first sample on: three times that of one that is not."""
+"""Settling time of a clock if the host stalls from the start, s: three times the usual time."""
 
 
 def read_late(
     stalls_s: Sequence[tuple[float, float]], seconds: float, begin_s: float
 ) -> NDArray[np.int64]:
-    """Return arrivals of a steady device at a host that works and stalls by turns."""
+    """Return arrivals of the samples of a device at a host that alternately works and stalls."""
     rng = np.random.default_rng(1)
     n = int(seconds * S / PERIOD)
     due = START + np.arange(n) * PERIOD + rng.exponential(3e5, n).astype(np.int64)
@@ -45,7 +45,7 @@ def read_late(
 
 
 def stamped(arrivals: NDArray[np.int64]) -> tuple[DeviceClock, list[tuple[int, Stamp]]]:
-    """Return the clock of a device 20 ppm fast, and true instant and stamp of every sample."""
+    """Return the clock of a device that is 20 ppm fast, and true instant and stamp of samples."""
     clock, out = DeviceClock(PERIOD), []
     for k, arrival in enumerate(arrivals.tolist()):
         ticks = (k * PERIOD * 1_000_020 // 1_000_000 + 60 * S) // 1000 % (1 << 32)
@@ -57,15 +57,17 @@ def stamped(arrivals: NDArray[np.int64]) -> tuple[DeviceClock, list[tuple[int, S
 stalls = st.lists(
     st.tuples(st.floats(0.02, 0.5), st.floats(0.2, 2.0)), min_size=1, max_size=5
 )  # fmt: skip
-"""Two periods of work hold a sample on time. Where none is, lateness that grows is a slow clock."""
+"""Durations of work and stall, s. Two periods of work contain a punctual sample. Without punctual
+samples, increasing delays cannot be distinguished from a slow clock.
+"""
 
 
 @settings(max_examples=15, deadline=None)
 @given(stalls, st.sampled_from([0.0, 6.0]))
 @example([(0.01, 2.0)], 6.0)
-@example([(0.103515625, 1.0234375)], 0.0)  # a few that waited 14 ms are no jitter
-@example([(0.5, 1.0), (0.5, 2.0)], 0.0)  # more samples that waited than did not
-@example([(0.25, 1.0)], 0.0)  # a line through the ends of two bursts is not yet known to a ms
+@example([(0.103515625, 1.0234375)], 0.0)  # waits of 14 ms are no jitter
+@example([(0.5, 1.0), (0.5, 2.0)], 0.0)  # most samples waited
+@example([(0.25, 1.0)], 0.0)  # a line through two bursts is not exact to 1 ms
 def test_stalls_and_bursts_are_late_data_and_no_restart(
     stalls_s: list[tuple[float, float]], begin_s: float
 ) -> None:
@@ -78,14 +80,14 @@ def test_stalls_and_bursts_are_late_data_and_no_restart(
 
 
 def test_a_clock_settles_on_a_starved_host() -> None:
-    """A tenth of a second of work, then 0.3 to 1.5 s of none, from the first sample on."""
+    """The host works for 0.1 s, then stalls for 0.3 to 1.5 s, from the first sample on."""
     _, out = stamped(read_late([(0.1, 0.3), (0.1, 1.5), (0.1, 0.7)], 20.0, 0.0))
     assert all(stamp.synced for _, stamp in out[int(SETTLING_S * S / PERIOD) :])
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_delivery_stalls_of_varying_length_do_not_move_the_clock(seed: int) -> None:
-    """Ten seconds in which nothing is on time: the queue grows and shrinks, the clock goes on."""
+    """No sample is punctual for ten seconds, because the queue is never empty."""
     rng = np.random.default_rng(seed)
     arrivals = read_late([(100.0, 0.0)], 30.0, 0.0)
     steps = np.abs(np.cumsum(rng.normal(0.0, 25.0 * MS, 1000)))
@@ -96,7 +98,7 @@ def test_delivery_stalls_of_varying_length_do_not_move_the_clock(seed: int) -> N
 
 
 def test_burst_from_before_the_start_does_not_settle_the_clock() -> None:
-    """Three seconds from a full buffer, read at once: one arrival, and no line through it."""
+    """The samples of three seconds arrive at once, and one arrival time determines no line."""
     arrivals = read_late([(100.0, 0.0)], 12.0, 0.0)
     arrivals[:300] = START + 3 * S + 2_000 * np.arange(300)
     clock, out = stamped(np.maximum.accumulate(arrivals))
@@ -107,7 +109,7 @@ def test_burst_from_before_the_start_does_not_settle_the_clock() -> None:
 
 
 def test_one_wrong_arrival_time_is_no_restart() -> None:
-    """A single sample that seems to come before it was taken is not stamped synced, that is all."""
+    """A single sample with an arrival before its measurement is unsynced, without other effects."""
     arrivals = read_late([(100.0, 0.0)], 12.0, 0.0)
     arrivals[800] -= 400 * MS
     clock, out = stamped(arrivals)
@@ -118,7 +120,7 @@ def test_one_wrong_arrival_time_is_no_restart() -> None:
 
 
 def test_a_backward_step_of_the_estimate_is_reported_once() -> None:
-    """Fast samples after minutes of a full queue: one news, unsynced until stamps fit again."""
+    """After a long full queue, punctual samples give one news and unsynced stamps for a while."""
     arrivals = read_late([(100.0, 0.0)], 30.0, 0.0)
     arrivals[:1500] += 300 * MS
     clock, out = stamped(arrivals)

@@ -1,4 +1,4 @@
-"""The lower envelope against brute force, and counters unwrapped."""
+"""The minimum-delay line, compared with an exhaustive search, and unwrapping of counters."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_unwrapping_undoes_wrapping(modulus: int, gaps: list[float], jitter: flo
         assert last == true
 
 
-def test_half_a_turn_divides_forward_from_reordered() -> None:
+def test_half_the_counter_range_separates_forward_from_reordered() -> None:
     assert unwrap(100, 256, 256, 0, S) == 356
     assert unwrap(127, 256, 256, 0, S) == 383
     assert unwrap(128, 256, 256, 0, S) == 128

@@ -1,4 +1,4 @@
-"""Three early samples, or two seconds of samples that are evenly late, are a clock fault."""
+"""Three early samples, or two seconds of samples with equal lateness, are a clock fault."""
 
 from __future__ import annotations
 

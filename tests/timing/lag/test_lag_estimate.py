@@ -64,7 +64,7 @@ def test_the_known_lag_of_a_real_recording_is_found(excerpt: Excerpt) -> None:
     assert 2 * np.arccos(estimate.q_imu_ref[0]) < np.radians(0.2)
 
 
-def test_a_rate_stamped_at_the_left_sample_would_be_found_out(excerpt: Excerpt) -> None:
+def test_a_rate_stamped_at_the_left_sample_would_be_detected(excerpt: Excerpt) -> None:
     imu, ref = excerpt.rates()
     lag, tolerance, _ = EXPECTED_MS[excerpt.name]
     wrong = replace(ref, t_s=ref.t_s - ref.period_s / 2)
@@ -73,7 +73,7 @@ def test_a_rate_stamped_at_the_left_sample_would_be_found_out(excerpt: Excerpt) 
 
 
 def test_ten_seconds_at_camera_rate_suffice(excerpt: Excerpt) -> None:
-    """Scatter of the estimates with optics at 120 Hz, random phase and random lag."""
+    """The scatter is measured with cameras at 120 Hz, random phase and random lag."""
     rng = np.random.default_rng(7)
     optical = Rotation.from_quat(excerpt.optical, scalar_first=True)
     found, sigmas = [], []
@@ -94,13 +94,13 @@ def test_ten_seconds_at_camera_rate_suffice(excerpt: Excerpt) -> None:
     lag, tolerance, spread = EXPECTED_MS[excerpt.name]
     assert np.mean(found) == pytest.approx(lag, abs=tolerance)
     assert np.std(found) < spread
-    assert 0.2 < np.std(found) / np.median(sigmas) < 1.5  # low: windows overlap
+    assert 0.2 < np.std(found) / np.median(sigmas) < 1.5  # low, because windows overlap
 
 
 def test_gaps_do_not_move_the_lag(excerpt: Excerpt) -> None:
     imu, ref = excerpt.rates()
     holes = excerpt.optical.copy()
-    holes[np.arange(len(holes)) % 286 < 14] = np.nan  # 50 ms a second
+    holes[np.arange(len(holes)) % 286 < 14] = np.nan  # 50 ms in every second
     gappy = rates_from_orientations(excerpt.t_ns, holes, 0)
     whole = estimate_lag_of_rates(imu, ref)
     estimate = estimate_lag_of_rates(imu, gappy)
@@ -108,7 +108,7 @@ def test_gaps_do_not_move_the_lag(excerpt: Excerpt) -> None:
     assert estimate.lag_ns == pytest.approx(whole.lag_ns, abs=0.05 * MS)
 
 
-def test_orientations_lead_the_gyro_they_are_made_of(excerpt: Excerpt) -> None:
+def test_integrated_orientations_lead_the_gyroscope(excerpt: Excerpt) -> None:
     """Integrated orientations lead the gyroscope by half a sample, so lags are not reusable."""
     steps = Rotation.from_rotvec(excerpt.gyro * 7 / 2000)
     path = [Rotation.identity()]
@@ -149,7 +149,7 @@ def test_wrong_conventions_are_refused(excerpt: Excerpt) -> None:
         assert estimate_lag_of_rates(imu, wrong).refused is not None
 
 
-# --- made-up motion, truth known --------------------------------------------------------------
+# --- simulated motion with known lag ----------------------------------------------------------
 
 
 def motion(seed: int, seconds: float, rate: float = 250.0) -> Rotation:
@@ -224,7 +224,7 @@ def test_either_stream_may_be_the_faster_one() -> None:
         there.q_imu_ref, scalar_first=True).apply(back.bias))) < 0.02  # fmt: skip
 
 
-def test_sigma_is_honest() -> None:
+def test_errors_are_consistent_with_sigma() -> None:
     """The errors divided by their sigma have a deviation of about one over the windows."""
     ratios = []
     for seed in range(16):

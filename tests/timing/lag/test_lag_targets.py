@@ -1,4 +1,4 @@
-"""Lag windows with little motion; the goals are in tests/bench/test_tables.py."""
+"""Lag windows with little motion; tests/bench/test_tables.py tests the targets."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_a_tap_in_a_window_of_rest_is_no_lag() -> None:
 
 
 def errors_of_short_passages(data: Path, settings: LagSettings) -> list[float]:
-    """Lag errors over their standard deviations, in 32 passages of one second of fast motion."""
+    """Return lag errors divided by standard deviations, for 32 passages of 1 s of fast motion."""
     recording = lag.excerpt(data, lag.FAST)
     body = rates_from_orientations(recording.t_ns, recording.optical, 0)
     rng = np.random.default_rng(1)
@@ -58,7 +58,7 @@ def test_the_standard_deviation_contains_the_stamp_error_of_a_short_passage(
 
 
 def test_even_motion_averages_the_stamp_error(shared_data: Path) -> None:
-    """Ten seconds of even motion: the accuracy of vigorous motion remains."""
+    """With ten seconds of even motion, the accuracy is that of vigorous motion."""
     recording = lag.excerpt(shared_data, lag.FAST)
     part = (recording.t_ns > 10e9) & (recording.t_ns < 20e9)
     imu = rates_from_gyro(recording.t_ns[part], recording.gyro[part], 0)
