@@ -25,7 +25,7 @@ class CalibrationError(Exception):
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str], taken: Collection[str] = ()) -> str:
-    """Return the message for a name that the stream does not have, with the nearest spelling.
+    """Return the message for a name that is not in the stream, with the most similar known name.
 
     Names in `taken`, which the rig already uses, are not suggested.
     """

@@ -1,4 +1,4 @@
-"""Quality figures of a calibration, which are stored and published with it as JSON tables.
+"""Quality figures of a calibration, which are stored and published as JSON tables.
 
 The names of the fields are the keys of the tables. Names of quantities end in their SI unit.
 """
@@ -39,15 +39,15 @@ class WorldQuality:
     """Alignment of the world of one sensor with the optical world."""
 
     kind: str
-    """Kind of the alignment: ``full``, ``heading`` (both verticals are assumed to be correct) or
-    ``stored``.
+    """Kind of the alignment: ``full``, ``heading`` (the verticals of both worlds are assumed to be
+    correct) or ``stored`` (copied from the current calibration).
     """
     kappa: float
-    """Measure of observability from 0 to 1. At 1, the rotation of the world and the
-    sensor-to-segment alignment cannot be distinguished.
+    """Ratio from 0 to 1. At 1, the rotation of the world and the sensor-to-segment alignment
+    cannot be distinguished.
     """
     error_rad: float
-    """Standard error in the least observable direction."""
+    """Standard error of the alignment in its least observable direction."""
     rms_rad: float
     """RMS angle between the measured and the modeled orientation of the plate."""
     lag_ns: int | None
@@ -117,7 +117,7 @@ class ChainQuality:
     refused: str | None = None
     """Reason why no marker was refined; the other fields are then None."""
     frames: int | None = None
-    """Number of frames of the refinement."""
+    """Number of frames from which the markers were refined."""
     judged: int | None = None
     """Number of held-out frames."""
     before: MarkerErrors | None = None
@@ -162,14 +162,16 @@ class CenterCoordinates:
 
 @dataclass(frozen=True, slots=True)
 class CenterQuality:
-    """Center of rotation of one joint from the movement, before the prior of the static pose."""
+    """Center of rotation of one joint from the movement, without the prior of the static pose."""
 
     method: str
     frames: int
     effective_frames: float
     """Number of independent frames."""
     predicted_error_m: float
-    """Root mean variance over the observed directions, including soft-tissue artefact."""
+    """Square root of the mean variance over the observed directions, including soft-tissue
+    artefact.
+    """
     noise_error_m: float
     """Part of the predicted error that decreases with more movement."""
     bound_m: float | None
@@ -263,16 +265,19 @@ class RegressionQuality:
 
 @dataclass(frozen=True, slots=True)
 class OnlineQuality:
-    """RMS errors of every segment, and of the flexion of every inner joint, in a refit."""
+    """RMS errors of the orientation of every segment and the flexion of every inner joint."""
 
     frames: int
     judged: int
     """Number of held-out frames."""
     before_rad: Mapping[str, float]
+    """Errors of the current models on the held-out frames."""
     after_rad: Mapping[str, float]
+    """Errors of the refitted models on the held-out frames."""
     known_before_rad: Mapping[str, float]
-    """Errors of the current models on the training frames of the calibration, rad."""
+    """Errors of the current models on the training frames of the calibration."""
     known_after_rad: Mapping[str, float]
+    """Errors of the refitted models on the training frames of the calibration."""
     rounds: int | None = None
     """Number of accepted refits since the functional calibration."""
     software: str | None = None

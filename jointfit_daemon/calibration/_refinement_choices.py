@@ -1,4 +1,4 @@
-"""Names of the methods and costs of a marker refinement; the refinement itself is not imported."""
+"""Names of the methods and costs of a marker refinement, without an import of the refinement."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ def robust_scale(magnitudes: NDArray[np.float64], floor: float = 1e-6) -> float:
 
 
 def huber_weights(magnitudes: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
-    r"""Return the weights min(1, 1.5 s / r), with the shape of `magnitudes`. Source: Huber 1964."""
+    """Return the weights min(1, 1.5 `scale` / `magnitudes`). Source: Huber 1964."""
     return np.minimum(1.0, HUBER_K * scale / np.maximum(magnitudes, 1e-300))
 
 

@@ -139,7 +139,7 @@ class OnlineFrames:
     (n, 4) for n frames.
     """
     markers: Mapping[str, Array]
-    """Positions of the k markers of each segment's cluster, optical world, m, shape (n, k, 3).
+    """Positions of the k markers of each segment in the optical world, m, shape (n, k, 3).
 
     A segment with a rigid body is in `bodies` instead."""
     bodies: Mapping[str, Array]

@@ -1,4 +1,4 @@
-"""A limb whose skin follows posture, without simulator: taught small bends, then bending far."""
+"""A limb with soft-tissue artefact that depends on posture, calibrated on small knee flexion."""
 
 from __future__ import annotations
 
@@ -29,13 +29,14 @@ SKIN = {
     "S3": (-0.15, 0.0, 0.05),
     "S4": (-0.1, 0.0, 0.0),
 }
-"""How far skin has turned a sensor at a bend of one radian, squared from there on, rad."""
+"""Rotation of each sensor by soft tissue at a knee flexion of 1 rad, rad. The rotation is
+proportional to the square of the flexion."""
 
 
 def moving(
     frames: int, bend: float, seed: int = 0, chain: Chain = CHAIN, rate_hz: float = 10.0
 ) -> LimbTraining:
-    """Return a movement that bends the knee by up to `bend`, rad, sensors on skin."""
+    """Return a movement with knee flexion up to `bend`, rad, and soft-tissue artefact."""
     t = np.arange(frames) / rate_hz
     dice = np.random.default_rng(seed)
     knee = -0.5 * bend * (1.0 - np.cos(1.3 * t + seed))
@@ -62,7 +63,7 @@ def _owners(chain: Chain) -> dict[str, str]:
 
 
 def fresh(training: LimbTraining) -> OnlineFrames:
-    """Return what sensors and cameras say of a movement: each segment's markers at a place."""
+    """Return a movement as frames of sensors and of the markers of each segment."""
     markers = {
         name: rotation.rotate(q[:, None], np.array(TEMPLATE)) + np.array([0.1, 0.2, 1.0])
         for name, q in training.reference.items()
@@ -72,7 +73,7 @@ def fresh(training: LimbTraining) -> OnlineFrames:
 
 @cache
 def calibration(chain: Chain = CHAIN, *, bodies: bool = False) -> Calibration:
-    """Return a calibration that has seen small bends only."""
+    """Return a calibration whose training movement has a knee flexion of at most 0.5 rad."""
     taught = moving(400, 0.5, chain=chain)
     models = fit_models(chain, taught, "anchored")
     cluster = StoredCluster(("A", "B", "C", "D"), None, TEMPLATE, (0.0, 0.0, 0.0), ONE)

@@ -1,4 +1,4 @@
-"""Robust scale, Huber weights, and how many looks a correlated series is worth."""
+"""Robust scale, Huber weights, and the effective number of samples of a correlated series."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from jointfit_daemon.calibration._robust_weights import effective_count, huber_weights, robust_scale
 
 
-def test_the_scale_of_normal_residuals_is_their_deviation_whatever_a_third_does() -> None:
+def test_the_robust_scale_is_the_deviation_in_spite_of_a_third_of_outliers() -> None:
     rng = np.random.default_rng(0)
     r = np.abs(rng.normal(0, 2.0, 20_000))
     assert robust_scale(r) == pytest.approx(2.0, rel=0.03)

@@ -87,10 +87,12 @@ class AccelerometerEstimate:
     bias_sd: Array
     """Standard deviations of the bias, m/s^2, shape (3,)."""
     matrix_sd: Array
-    """Standard deviations of the elements of the matrix; NaN where they are not estimated."""
+    """Standard deviations of the elements of `matrix`, shape (3, 3); NaN where an element is not
+    estimated.
+    """
     covariance: Array
     """Covariance of the bias (m/s^2), the diagonal of `matrix` and, if estimated, its upper
-    off-diagonal elements.
+    off-diagonal elements, shape (6, 6) or (9, 9).
     """
     degrees_of_freedom: int
     """Number of poses minus number of parameters."""

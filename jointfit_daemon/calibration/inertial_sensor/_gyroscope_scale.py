@@ -65,9 +65,13 @@ class GyroscopeScaleEstimate:
     """Inverse scale factors, and gyroscope axes relative to the accelerometer axes, shape (3,
     3)."""
     matrix_sd: Array
-    """Standard deviations of the elements of `matrix`; NaN where they are not estimated."""
+    """Standard deviations of the elements of `matrix`, shape (3, 3); NaN where an element is not
+    estimated.
+    """
     covariance: Array
-    """Covariance of the diagonal of `matrix`, or of all elements by rows."""
+    """Covariance of the diagonal of `matrix`, shape (3, 3), or of all elements by rows, shape
+    (9, 9).
+    """
     degrees_of_freedom: int
     """Twice the number of turns minus the number of parameters."""
     turns: int

@@ -250,7 +250,7 @@ class MagnetometerStep:
 
     @property
     def is_complete(self) -> bool:
-        """Whether the readings cover the directions."""
+        """Whether there are enough readings, and they cover enough directions."""
         enough = len(self._fields) >= FEWEST_READINGS
         return enough and len(self._missing) <= len(DIRECTIONS) - COMPLETE
 

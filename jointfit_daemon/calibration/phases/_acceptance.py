@@ -1,4 +1,4 @@
-"""Comparison of a new calibration with the current calibration. A rejection has a reason."""
+"""Comparison of a new calibration with the current calibration."""
 
 from __future__ import annotations
 
@@ -33,27 +33,28 @@ def compare_calibrations(new: Calibration, old: Calibration | None) -> Calibrati
     this order, the chain, the use of cameras, the alignment of the worlds, and all errors together.
     An error is the hold-out error of a segment, the hold-out error of the flexion of an inner
     joint, or the gap of a joint. The gap is the distance between the two centers that are fixed in
-    the two body parts of the joint. A hold-out error may be larger by the factor 1.15 plus 0.3°,
-    and a gap by 5 mm. A center that was estimated from the movement must not be replaced by a
-    center from another source.
+    the two body parts of the joint. A hold-out error may be 1.15 times the old error plus 0.3°, and
+    a gap may be 5 mm larger than the old gap. A center that was estimated from the movement must
+    not be replaced by a center from another source.
     """
     if old is None:
         return CalibrationComparison(True, "no calibration was in force")
     chains = [(one.joints, one.segments, one.chain_sensors) for one in (new, old)]
     if chains[0] != chains[1]:
         return CalibrationComparison(
-            True, "the stored one belongs to another chain or other sensors"
+            True, "the stored calibration belongs to another chain or other sensors"
         )
 
     had, has = "holdout" in old.quality, "holdout" in new.quality
     if had != has:
-        return CalibrationComparison(has, f"only the {'new' if has else 'stored'} one used cameras")
+        which = "new" if has else "stored"
+        return CalibrationComparison(has, f"only the {which} calibration used cameras")
 
     assumed = FrameFlag.HEADINGS_FROM_STATIC
     if (assumed in old.flags) != (assumed in new.flags):
         aligned = assumed in old.flags
         return CalibrationComparison(
-            aligned, f"only the {'new' if aligned else 'stored'} one has an align phase"
+            aligned, f"only the {'new' if aligned else 'stored'} calibration has an align phase"
         )
 
     worse = [*_worse_angles(new, old), *_worse_joints(new, old)] if has else []
@@ -84,7 +85,8 @@ def _worse_joints(new: Calibration, old: Calibration) -> list[str]:
         now = new.joint[name]
         if was.source == "fit" and now.source != "fit":
             found.append(
-                f"{name}: its center was estimated from the movement, now it is {now.source}"
+                f"{name}: the stored center was estimated from the movement, the new center has "
+                f"the source {now.source!r}"
             )
         elif (now.gap_rms or 0.0) > (was.gap_rms or np.inf) + SLACK_M:
             found.append(

@@ -1,10 +1,9 @@
 """Refinement of the markers of a chain model by inverse kinematics of the movement.
 
-Positions are refined on the first part of the movement and evaluated on the rest. If the markers of
-a segment do not have a smaller error on the rest, the segment keeps the positions of the model. If
-the error of the whole model is not smaller, all segments keep the positions of the model. If the
-model does not fit the movement, the fault is reported, and the calibration continues without a
-refinement.
+Positions are refined on the first part of the movement and evaluated on the rest. A segment uses
+the refined positions only if they reduce the error of its markers on the rest. If they do not
+reduce the error of the whole model, all segments use the positions of the model. If the model does
+not fit the movement, the fault is reported, and the calibration continues without a refinement.
 """
 
 from __future__ import annotations
@@ -70,7 +69,7 @@ class ChainOutcome:
 def refine_chain(
     functional: CalibrationTrial, settings: CalibrationSettings, control: JobControl
 ) -> ChainOutcome:
-    """Refine the markers of the chain model of the rig, if it has one.
+    """Refine the markers of the chain model of the rig, if the rig has a chain model.
 
     Parameters
     ----------
@@ -114,7 +113,7 @@ def with_refined_chain(
     settings: CalibrationSettings,
     control: JobControl,
 ) -> Calibration:
-    """Return the calibration with the refined markers of the chain model, figures and notes."""
+    """Return the calibration with the refined chain model; unchanged without a chain model."""
     outcome = refine_chain(functional, settings, control)
     if outcome.figures is None:
         return calibration
@@ -124,7 +123,7 @@ def with_refined_chain(
 
 
 def marker_trial(model: ChainModel, optical: OpticalTrack) -> MotionTrial:
-    """Return the markers of the model in a movement, NaN where missing."""
+    """Return the positions of the model's markers in a movement; NaN where a marker is missing."""
     targets = np.full((len(optical.t_ns), len(model.markers), 3), np.nan)
     for at, name in enumerate(model.marker_names):
         if name in optical.markers:
@@ -191,7 +190,7 @@ def _select(
 def _part_errors(
     model: ChainModel, holdout: TrialOutcome, segments: set[str]
 ) -> dict[str, tuple[float, float]]:
-    """Return the RMS error of the markers of each segment before and after, m."""
+    """Return the RMS errors of the markers of each segment before and after refinement, m."""
     names = np.array([m.segment for m in model.markers])
     before, after = holdout.before.by_marker, holdout.after.by_marker
     return {s: (rms(before[names == s], 0.0), rms(after[names == s], 0.0)) for s in segments}

@@ -1,9 +1,9 @@
 r"""Refinement of marker positions on body parts from the functional movement.
 
-The static pose contains markers in one state of the soft tissue. The movement contains thousands of
-states, and shows whether a marker is displaced. The markers of each part are refined by
-`marker_refinement`, without joints between the parts. Joint centers from skin markers have errors
-of a centimeter and would distort the shapes. A rotation of a whole part is unobservable. The
+The static pose shows the markers in one state of the soft tissue. The movement shows thousands of
+states, and therefore whether a marker is displaced. The markers of each part are refined by
+`marker_refinement`, without joints between the parts, because joint centers from skin markers have
+errors of a centimeter and would distort the shapes. A rotation of a whole part is unobservable. The
 refined shape :math:`p'` is therefore fitted to the marker positions :math:`p` of the static pose,
 
 .. math:: \min_{R,t} \sum_k \rho(|R p'_k + t - p_k|)

@@ -124,14 +124,14 @@ def fit_calibration(
     chain : Chain
         The limb.
     previous : Calibration, optional
-        Calibration whose lags are used where this movement determines none.
+        Calibration whose lags are used for sensors whose lag this movement does not determine.
     software : str
-        Version of the program, which the calibration contains.
+        Version of the program, which is stored in the calibration.
     lag_ns : mapping, optional
-        Configured lags, ns. The lags of other sensors are estimated.
+        Configured lags by sensor, ns. The lags of other sensors are estimated.
     tracked : mapping, optional
-        Lags and standard deviations that were tracked at run time, ns. They are used where this
-        movement determines none.
+        Lags and standard deviations that were tracked at run time, by sensor, ns. A tracked lag
+        replaces the lag from `previous` if its standard deviation is smaller.
 
     Raises
     ------
@@ -209,7 +209,8 @@ def _tracks(
         if misfit > MIN_SEEN:
             reasons.append(
                 f"{segment}: in {100 * misfit:.0f} % of the trial its markers do not fit the "
-                "static pose; check their names and whether one was displaced, and repeat the pose"
+                "static pose; check the marker names, and whether a marker was displaced, and "
+                "repeat the pose"
             )
             continue
         share = float(visible(tracks[segment].q).mean()) if segment in tracks else 1.0

@@ -130,7 +130,7 @@ def _previous(job: StaticJob | FunctionalJob | RefitJob) -> Calibration | None:
 
 
 def _alignment(job: StaticJob | FunctionalJob) -> PlateAlignment | None:
-    """Return the alignment of this session, otherwise that of the current calibration, or None."""
+    """Return the alignment of this session or of the current calibration; None without either."""
     if job.alignment is not None:
         return PlateAlignment.from_dict(job.alignment)
     previous = _previous(job)

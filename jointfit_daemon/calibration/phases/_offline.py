@@ -2,8 +2,8 @@
 
 Sensors and reference have the same world and the same time axis, so clocks and markers are not
 needed. The evaluation always uses held-out data, either a whole trial or the last part of a single
-trial. The resulting calibration has the same form as a calibration by the daemon; lengths and joint
-centers are unknown.
+trial. The resulting calibration has the same form as a calibration by the daemon. Its joint centers
+are unknown, and its lengths are those that the caller supplies.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ if TYPE_CHECKING:
 
 
 COMPARED: tuple[Method, ...] = tuple(method for method in METHODS if method != "single")
-"""Evaluated methods. ``single`` is omitted, because each sensor is also evaluated alone."""
+"""Methods that are evaluated. ``single`` is omitted, because each sensor is evaluated alone, too.
+"""
 MAX_TRAINING_FRAMES = 2000
 """Largest number of training frames of one trial; longer trials are decimated."""
 
@@ -89,9 +90,9 @@ class MethodScore:
     segments: Mapping[str, float]
     """RMS angle between estimate and reference, rad, by segment."""
     joints: Mapping[str, float]
-    """RMS error of flexion about the functional axis of the training movement, rad."""
+    """RMS error of flexion about the functional axis of the training movement, rad, by joint."""
     flexion: Mapping[str, Array]
-    """Estimated flexion over time, rad, shape (n,)."""
+    """Estimated flexion over time, rad, shape (n,), by joint."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,9 +111,8 @@ class MethodEvaluation:
 def mounts_of(chain: Chain, trials: Sequence[OfflineTrial]) -> dict[str, RobustMean]:
     """Return ``q_sensor_segment`` of every sensor from the reference of whole trials.
 
-    For a static trial the result is the static calibration. For movements it is the mean over the
-    soft-tissue artefact and depends on the reference. Such a result is suitable for research, but
-    not for another session.
+    For a static trial the result is the static calibration. For a movement the result contains the
+    mean soft-tissue artefact of this movement, so it is not valid for another session.
     """
     found = {}
     for i, segment in enumerate(chain.segments):

@@ -39,7 +39,7 @@ rad."""
 
 
 def unmoved_joint(chain: Chain, trials: Sequence[OfflineTrial]) -> str | None:
-    """Return a message on a joint (or single segment) that does not move; None if there is none."""
+    """Return a message on a joint (or single segment) without movement; None if all move."""
     reference = {s: np.concatenate([t.reference[s] for t in trials]) for s in chain.segments}
     movements = {
         joint.name: joint_rotation(
@@ -63,7 +63,7 @@ def unmoved_joint(chain: Chain, trials: Sequence[OfflineTrial]) -> str | None:
 def trial_warnings(
     chain: Chain, trials: Sequence[OfflineTrial], mounts: Mapping[str, Array] | None
 ) -> list[str]:
-    """Return warnings that affect the credibility of results from these trials."""
+    """Return warnings about sensors that make the results from these trials doubtful."""
     worn = [name for group in chain.sensors for name in group]
     sensors = {name: np.concatenate([t.sensors[name] for t in trials]) for name in worn}
     return [
@@ -99,7 +99,8 @@ def _turned_worlds(chain: Chain, trials: Sequence[OfflineTrial]) -> Iterator[str
         if alignment.kappa <= HEADING_SEPARABLE and abs(angle) > MISALIGNED:
             yield (
                 f"{sensor}: its world seems rotated by {np.rad2deg(angle):.0f}° about the vertical "
-                "relative to that of the reference; transform both to one world, or check --up"
+                "relative to the world of the reference; transform both to one world, or check "
+                "--up"
             )
 
 

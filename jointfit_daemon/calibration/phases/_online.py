@@ -77,8 +77,8 @@ CONTRADICTED = np.deg2rad(8.0)
 this angle one of the two is wrong.
 """
 SHIFTED = np.deg2rad(5.0)
-"""Largest length of the median rotation vector from the orientations of the current models to those
-from the cameras, rad. A displaced marker cluster causes a larger rotation.
+"""Largest length of the median rotation vector from the orientations of the current models to the
+orientations from the cameras, rad. A displaced marker cluster causes a larger rotation.
 """
 TURN_FRAMES = 150
 """Number of frames over which heading drift is assumed to be constant: 15 s."""
@@ -98,13 +98,13 @@ def refit_models(
     chain : Chain
         The limb.
     software : str
-        Version of the program, which the quality figures contain.
+        Version of the program, which is stored in the quality figures.
 
     Returns
     -------
     FitResult
-        Result whose ``quality["online"]`` contains the errors before and after, rad. If the
-        candidate is accepted, ``calibration`` is set. Otherwise ``kept`` contains the reason to
+        Result whose ``quality["online"]`` contains the errors before and after the refit, rad. If
+        the candidate is accepted, ``calibration`` is set. Otherwise ``kept`` contains the reason to
         retain the current models.
 
     Raises
@@ -123,8 +123,8 @@ def refit_models(
     cut = round(len(new) * (1.0 - HELD))
     older, newest = new.rows(slice(None, cut)), new.rows(slice(cut, None))
 
-    # The candidate is fitted without the newest frames, and evaluated on these and on earlier
-    # frames.
+    # The candidate is fitted without the newest frames. It is evaluated on the newest frames and
+    # on the training frames of the calibration.
     training = join_training(known, thin_evenly(chain, older))
     in_force = _in_force(calibration, chain)
     candidate = {
@@ -181,7 +181,7 @@ def _reference(calibration: Calibration, frames: OnlineFrames, chain: Chain) -> 
         if good < 1.0 - MOST_LEFT_OUT:
             raise CalibrationError(
                 f"{name}: in {100 * (1 - good):.0f} % of the frames its markers do not fit the "
-                "static pose; check their names, and whether one was displaced"
+                "static pose; check the marker names, and whether a marker was displaced"
             )
         q_static = np.array(calibration.segment[name].q_static)
         reference[name] = rotation.multiply(turn, q_static)
@@ -197,8 +197,8 @@ def _without_heading_drift(
 ) -> LimbTraining:
     """Return the frames without heading drift; raise an error if cameras and models disagree.
 
-    Sensor headings drift over minutes, independent of posture. The rotation about the vertical
-    between cameras and models, averaged over 15 s, is therefore removed from the reference.
+    Sensor headings drift over minutes, independent of posture. The median rotation about the
+    vertical between cameras and models over 15 s is therefore removed from the reference.
     """
     estimates = _predictions(chain, _in_force(calibration, chain), new)
     reference = {}
@@ -259,10 +259,13 @@ def _rejection(figures: OnlineQuality) -> str | None:
     before, after = figures.before_rad, figures.after_rad
     was, now = (float(np.mean([x**2 for x in f.values()])) ** 0.5 for f in (before, after))
     if now > min(GAIN * was, was - GAIN_RAD):
-        return f"no improvement on the newest frames: {_deg(now)}, was {_deg(was)}"
+        return f"no improvement on the newest frames: error {_deg(now)}, was {_deg(was)}"
     for name, figure in after.items():
         if figure > before[name]:
-            return f"{name}: worse on the newest frames: {_deg(figure)}, was {_deg(before[name])}"
+            return (
+                f"{name}: larger error on the newest frames: {_deg(figure)}, was "
+                f"{_deg(before[name])}"
+            )
 
     before = figures.known_before_rad
     for name, figure in figures.known_after_rad.items():

@@ -42,8 +42,8 @@ if TYPE_CHECKING:
 MIN_FRAMES = 200
 """Smallest number of frames in which the sensor has data and the plate is visible."""
 MAX_RMS = np.deg2rad(6.0)
-"""Largest residual, rad. A larger residual indicates a loose sensor, a sensor that is not on the
-plate, or swapped markers.
+"""Largest robust scale of the residual angles, rad. A larger scale indicates a loose sensor, a
+sensor that is not on the plate, or swapped markers.
 """
 MAX_FRAMES = 3000
 """Largest number of frames that are used; longer recordings are decimated."""

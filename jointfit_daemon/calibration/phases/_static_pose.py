@@ -120,7 +120,10 @@ def fit_static(trial: CalibrationTrial, settings: CalibrationSettings, chain: Ch
 def sensor_calibration(
     mean: RobustMean, q_optical_world: Quaternion, q_static: Quaternion, lag_ns: int = 0
 ) -> SensorCalibration:
-    """Return a sensor with the mount (q_optical_world q_world_sensor)* q_optical_segment."""
+    """Return the calibration of one sensor from its mean orientation in the static pose.
+
+    The sensor-to-segment alignment is (q_optical_world q_world_sensor)* q_optical_segment.
+    """
     q_optical_sensor = rotation.multiply(q_optical_world, mean.q)
     bias = rotation.multiply(rotation.conjugate(q_optical_sensor), q_static)
     return SensorCalibration(q_optical_world, as_quaternion(bias), lag_ns, mean.spread)
@@ -181,7 +184,7 @@ def fit_static_only(
 def with_new_static(
     calibration: Calibration, pose: StaticPose, alignment: PlateAlignment | None = None
 ) -> Calibration:
-    """Return the calibration with new alignments, after sensors were re-donned.
+    """Return the calibration with new sensor-to-segment alignments, after re-donning.
 
     If the markers of a segment are visible and at their earlier positions on the body, they
     determine the current orientation of the segment. Otherwise, and in the procedure of the patent,
@@ -191,7 +194,7 @@ def with_new_static(
     Parameters
     ----------
     alignment : PlateAlignment, optional
-        Alignment that is newer than the calibration. Its worlds and estimated lags are used.
+        Plate alignment that is newer than the calibration. Its worlds and estimated lags are used.
 
     Raises
     ------
@@ -219,7 +222,7 @@ def with_new_static(
         q = segment.q_static if turned is None else rotation.multiply(turned, segment.q_static)
         q_now[name] = as_quaternion(q)
 
-    # The mounts are computed from the new means, worlds and lags from a newer alignment.
+    # The mounts are computed from the new means. A newer alignment supplies worlds and lags.
     owner = {
         sensor: segment
         for segment, group in zip(calibration.segments, calibration.chain_sensors, strict=True)

@@ -1,7 +1,7 @@
 """Check of the content of a stored calibration: types, shapes, ranges and names.
 
-Invariant: no other code raises an error for a calibration without faults. The check also evaluates
-the models, because the shapes of their arrays depend on each other.
+Invariant: a calibration in which this check finds no fault causes no error in other code. The check
+also evaluates the models, because the shapes of their arrays depend on each other.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def _faults(c: Calibration) -> Iterator[str]:
 
     yield from _branches(c)
 
-    # The names are correct at this point, so the content of each record can be checked.
+    # The content of each record.
     yield from _sensors(c)
     for name, segment in c.segment.items():
         yield from _segment(name, segment)

@@ -62,7 +62,7 @@ class StoredCalibration:
 
 
 class CalibrationStore:
-    """The versions of one name in one directory, ``DIRECTORY/NAME/0001.json`` and so on.
+    """The versions of the calibration of one name, ``DIRECTORY/NAME/0001.json`` and so on.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ class CalibrationStore:
         """Link the file under the next free number, and return this number.
 
         Unlike a rename, linking never replaces a file. The file is renamed only if the file system
-        has no links.
+        has no hard links.
         """
         names = (_TAKEN.fullmatch(path.name) for path in self._directory.iterdir())
         version = max((int(match[1]) for match in names if match), default=0) + 1

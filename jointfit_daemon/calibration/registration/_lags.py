@@ -10,7 +10,7 @@ where :math:`\tau_i` is the true lag of sensor i, n the noise of the fit, d the 
 tissue of each sensor, and c the bias from the soft tissue of the markers, common to all sensors.
 The lags of the align phase were measured on a plate without soft tissue. The two kinds of lags are
 weighted by their precision. A sensor with a known lag thus determines c, and c improves the lag of
-a neighbor that was not on the plate. Lags that are too uncertain are absent.
+a neighbor that was not on the plate. Lags that are too uncertain are absent from the results.
 """
 
 from __future__ import annotations

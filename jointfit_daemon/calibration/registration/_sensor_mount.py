@@ -179,7 +179,7 @@ def _decompose(kind: AlignmentKind, T: Array, signed_weights: Array) -> tuple[Ar
 
 
 def _columns(kind: AlignmentKind) -> list[int]:
-    """Return the free components of v; a rotation about the vertical has no x and y."""
+    """Return the indices of the free components of v; a heading rotation has no x and y."""
     return [0, 3] if kind == "heading" else [0, 1, 2, 3]
 
 

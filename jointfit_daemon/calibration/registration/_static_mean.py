@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 MAX_DISAGREEMENT = np.deg2rad(3.0)
-"""Largest difference between the changes of two sensors on one segment since the last pose, rad."""
+"""Largest difference between the changes of two mounts on one segment since the last pose, rad."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Segment frames of an arm from markers, whatever direction the shoulder moves in."""
+"""Segment frames of an arm from markers, for movements of the shoulder in any direction."""
 
 from __future__ import annotations
 

@@ -103,11 +103,11 @@ def test_three_frames_of_a_live_track_weight_their_noise_by_the_residuals_of_the
     plain = predicted_variance(None)
     assert predicted_variance(np.full_like(shank.points[..., 0], 3e-4)) == pytest.approx(plain)
     assert predicted_variance(np.where(used, 2e-4, 6e-4)) < 0.8 * plain
-    # the disagreement of the four markers limits it in the other direction
+    # the four markers disagree, so small residuals cannot reduce the variance
     assert predicted_variance(np.where(used, 6e-4, 2e-4)) > 0.99 * plain
 
 
-def test_an_ankle_with_an_imu_on_the_shank_only_uses_its_angle() -> None:
+def test_an_ankle_uses_the_angle_of_the_shank_if_the_foot_has_no_imu() -> None:
     found = center_of("ankle", "oriented")
     assert np.linalg.norm(found.center - truth(SUBJECT)["ankle"]) < 0.01
 

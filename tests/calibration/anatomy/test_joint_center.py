@@ -1,4 +1,4 @@
-"""Joint centers: recovered within the noise put in, honest about what a hinge does not show."""
+"""Joint centers of simulated movements: errors, covariance, and undetermined directions."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SIDE = np.array([1.0, -1.0, 0.75])
 
 
 def ball(rng: np.random.Generator, arc_deg: float, n: int = 200, sigma: float = 1e-3) -> Array:
-    """Markers of a ball joint moved in all directions, in the parent's frame."""
+    """Return markers of a ball joint that moves in all directions, in the parent's frame, m."""
     h = np.radians(arc_deg) / 2
     a, phi = h * np.sqrt(rng.uniform(size=n)), rng.uniform(0, 2 * np.pi, n)
     vectors = np.stack((a * np.cos(phi), a * np.sin(phi), rng.uniform(-h, h, n)), axis=1)
@@ -47,7 +47,7 @@ def hinge(
 
 
 def information_bound(points: Array, sigma: float) -> float:
-    """RMS bound of the center by the Fisher information of the radii and the center."""
+    """Return the Cramér-Rao bound of the RMS error of the center, with unknown radii, m."""
     d = points - CENTER
     u = d / np.linalg.norm(d, axis=-1, keepdims=True)
     n, k, _ = u.shape
@@ -75,13 +75,13 @@ def test_joint_center_error_is_near_the_cramer_rao_bound_and_matches_its_covaria
     assert 0.75 < np.sqrt(np.mean(claimed) / np.mean(errors)) < 1.35
 
 
-def test_a_start_far_off_ends_at_the_same_place() -> None:
+def test_a_distant_start_gives_the_same_center() -> None:
     points = ball(np.random.default_rng(2), 60)
     near, far = fit_center(points, CENTER), fit_center(points, CENTER + 0.2 * SIDE)
     assert np.allclose(near.center, far.center, atol=1e-5)
 
 
-def test_a_hinge_shows_its_axis_and_leaves_the_rest_to_the_start() -> None:
+def test_the_center_of_a_hinge_is_undetermined_along_the_axis_only() -> None:
     rng = np.random.default_rng(3)
     axis = np.array([0.9, 0.3, -0.1]) / np.linalg.norm([0.9, 0.3, -0.1])
     start = CENTER + 0.07 * axis + 0.05 * np.array([0, 0, 1])

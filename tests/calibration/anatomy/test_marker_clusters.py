@@ -1,4 +1,4 @@
-"""Rigid fits of arbitrary markers: any three seen suffice, a line never does, names are checked."""
+"""Rigid fits of marker clusters: three visible markers suffice unless they are on a line."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_a_heavier_marker_pulls_the_fit_towards_itself() -> None:
     assert gaps[1] < 0.2 * gaps[0]
 
 
-def test_a_cluster_carries_its_static_world_points() -> None:
+def test_a_cluster_transforms_points_from_and_to_the_static_world() -> None:
     rng = np.random.default_rng(1)
     still = np.repeat(TEMPLATE[None] + SHIFT, 100, axis=0) + rng.normal(0, 1e-4, (100, 4, 3))
     settings = CalibrationSettings(markers={"thigh": ("T1", "T2", "T3", "T4")})
@@ -171,7 +171,7 @@ def test_a_template_is_learned_from_a_turning_plate() -> None:
     assert np.abs(fitted - TEMPLATE).max() < 5e-4
 
 
-def test_a_marker_that_comes_and_goes_makes_no_jump_where_skin_has_moved() -> None:
+def test_an_intermittent_marker_causes_no_jump_in_spite_of_soft_tissue() -> None:
     rng = np.random.default_rng(5)
     shift = rng.normal(0, 0.008, TEMPLATE.shape)
     drift = np.linspace(0.5, 1.0, 120)[:, None, None]
@@ -183,6 +183,6 @@ def test_a_marker_that_comes_and_goes_makes_no_jump_where_skin_has_moved() -> No
     q_plain, _, _ = rigid_fit(TEMPLATE, gappy)
     q, p, _ = steady_fit(TEMPLATE, gappy)
     plain = (q_plain - q_whole)[np.isnan(gappy).any(axis=(1, 2))]
-    assert np.abs(plain).max() > 5e-3  # the jump there would be
+    assert np.abs(plain).max() > 5e-3  # the jump of a plain fit
     assert np.abs(q - q_whole).max() < 1e-5
     assert np.abs(p - p_whole).max() < 1e-5

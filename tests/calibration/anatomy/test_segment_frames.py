@@ -1,4 +1,4 @@
-"""Joint centers, lengths and axes found from markers against the geometry that made them."""
+"""Joint centers, lengths and axes from markers, compared with the simulated geometry."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_centers_lengths_and_axes_are_recovered(
     assert found.flags == ()
 
 
-def test_without_foot_markers_a_configured_length_hangs_the_ankle_under_the_knee() -> None:
+def test_without_foot_markers_the_ankle_is_a_configured_length_below_the_knee() -> None:
     subject, chain = Subject(1), replace(CHAIN, lengths=(None, 0.4), distal=None)
     found = anatomy(subject, chain, ("pelvis", "thigh", "shank"))
     ankle = found.joints["ankle"]

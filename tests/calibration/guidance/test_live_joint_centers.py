@@ -125,7 +125,7 @@ def test_an_occluded_body_part_is_named_with_its_remedy() -> None:
     assert "toward the cameras" in most_urgent(look.missing)
     assert look.joints["hip"]["predicted_error_mm"] is None
     assert look.joints["hip"]["source"] == "unknown"
-    assert look.joints["knee"]["source"] != "sensors", "the others go on"
+    assert look.joints["knee"]["source"] != "sensors", "the other joints are still reported"
 
 
 def test_swapped_names_are_named() -> None:
@@ -198,7 +198,7 @@ def test_sideways_movement_is_requested_of_a_hip_that_moves_about_one_axis() -> 
     assert look.joints["hip"]["met"] is True
 
 
-def test_a_frame_without_markers_or_with_other_names_is_no_frame() -> None:
+def test_a_frame_without_markers_or_with_other_names_is_ignored() -> None:
     static, track = trials()
     guide = MovementGuide(CHAIN, SETTINGS, static)
     nothing = MocapFrame(
@@ -218,6 +218,8 @@ def test_an_end_joint_without_markers_has_its_configured_length_or_nothing() -> 
     static, _ = trials()
     look = MovementGuide(chain, SETTINGS, static).update({}, 0.0)
     assert look.joints["ankle"]["source"] == "configured"
-    assert look.joints["ankle"]["met"] is True, "it cannot be estimated, so it is not waited for"
+    assert look.joints["ankle"]["met"] is True, (
+        "the phase waits for a joint that cannot be estimated"
+    )
     unknown = MovementGuide(replace(chain, lengths=()), SETTINGS, static)
     assert unknown.update({}, 0.0).joints["ankle"]["source"] == "unknown"

@@ -1,4 +1,4 @@
-"""The missing movement of a joint: its random error beside the target."""
+"""The text on the missing movement of a joint: random error of its center, and target."""
 
 from __future__ import annotations
 

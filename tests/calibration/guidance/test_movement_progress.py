@@ -1,4 +1,4 @@
-"""The guide through a functional movement: arcs seen, whoever of the sensors is alive."""
+"""Progress of a functional movement: observed arcs, also after the loss of a sensor."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def about_x(degrees: float) -> tuple[float, float, float, float]:
 
 def test_arc_is_the_relative_rotation_of_the_segments() -> None:
     progress = MovementProgress(CHAIN)
-    for degrees in range(-10, 51, 5):  # both turn along by another 20 degrees
+    for degrees in range(-10, 51, 5):  # both segments also rotate by 20 degrees
         progress.update({"S1": about_x(20 + degrees), "S3": about_x(20 + 2 * degrees)})
     assert math.degrees(progress.arcs()["knee"]) == pytest.approx(60.0)
 
@@ -29,11 +29,11 @@ def test_a_sensor_that_takes_over_for_a_lost_one_adds_no_arc() -> None:
     progress = MovementProgress(CHAIN)
     progress.update({"S1": UPRIGHT, "S2": about_x(90), "S3": UPRIGHT})
     progress.update({"S1": UPRIGHT, "S2": about_x(90), "S3": about_x(10)})
-    progress.update({"S2": about_x(90), "S3": about_x(10)})  # mounted otherwise; nothing moved
+    progress.update({"S2": about_x(90), "S3": about_x(10)})  # another mount, and no movement
     assert math.degrees(progress.arcs()["knee"]) == pytest.approx(10.0)
 
 
-def test_more_arc_and_more_time_promise_a_smaller_error() -> None:
+def test_more_arc_and_more_time_reduce_the_predicted_error() -> None:
     errors = []
     for arc in (20.0, 60.0):
         progress = MovementProgress(CHAIN)
@@ -44,7 +44,7 @@ def test_more_arc_and_more_time_promise_a_smaller_error() -> None:
     assert len(set(errors)) == len(errors)
 
 
-def test_without_movement_no_error_is_promised() -> None:
+def test_without_movement_no_error_is_predicted() -> None:
     progress = MovementProgress(CHAIN)
     progress.update({"S1": UPRIGHT, "S3": UPRIGHT})
     assert progress.predicted_center_errors(10.0) == {"knee": None}

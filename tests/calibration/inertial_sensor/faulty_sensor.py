@@ -26,7 +26,10 @@ FIELD = 48.0
 
 @dataclass(frozen=True)
 class FaultySensor:
-    """Measured = matrix true + bias + noise; the matrices but the gyroscope's are symmetric."""
+    """A sensor that measures matrix · truth + bias + noise.
+
+    The matrices of accelerometer and magnetometer are symmetric.
+    """
 
     gyroscope_bias: Array
     accelerometer_bias: Array
@@ -121,7 +124,7 @@ def symmetric(rng: np.random.Generator, scale_sd: float, skew_sd: float) -> Arra
 
 
 def poses() -> Array:
-    """Return six faces and six edges, as the guide asks for."""
+    """Return the directions that the guide requests: six faces and six edges."""
     return DIRECTIONS[[0, 1, 2, 3, 4, 5, 6, 7, 10, 11, 14, 15]]
 
 

@@ -53,7 +53,10 @@ def test_a_step_is_kept_while_it_helps_and_halved_only_when_neither_way_does() -
     only = np.zeros((1, 3), dtype=np.bool_)
     only[0, 0] = True
     search(error, np.zeros((1, 3)), only, SearchSettings(0.008, 0.002))
-    there = [0, 8, 16, 24, 32]  # three steps help, the fourth does not
-    halved = [32, 16, 28, 20, 16]  # neither way by 8; of 4, back to 20 and no farther
-    ended = [24, 16, 22, 18]  # neither by 4 nor by 2
+    # The minimum is at 21 mm. Three steps of 8 mm reduce the error, the fourth step does not.
+    there = [0, 8, 16, 24, 32]
+    # No step of 8 mm reduces the error. Of the steps of 4 mm, only the step from 24 to 20 does.
+    halved = [32, 16, 28, 20, 16]
+    # No step of 4 mm or 2 mm from 20 reduces the error.
+    ended = [24, 16, 22, 18]
     np.testing.assert_allclose(1000 * np.array(asked), there + halved + ended)

@@ -157,7 +157,7 @@ def test_all_input_faults_are_reported_together() -> None:
     assert "empty" in str(why.value)
 
 
-def test_a_crowd_of_wrong_labels_is_refused_by_the_error_it_leaves() -> None:
+def test_many_wrong_labels_are_refused_because_of_the_remaining_error() -> None:
     given = trial()
     given.targets[:] = given.targets[:, [4, 6, 5, 7, 1, 3, 0, 2]]
     assert refused(given)

@@ -82,11 +82,11 @@ def misplaced(model: ChainModel, spread: float = 0.01) -> ChainModel:
 
 
 @pytest.mark.parametrize("method", ["joint", "block"])
-def test_without_noise_markers_are_found_where_they_are(method: RefinementMethod) -> None:
+def test_without_noise_the_true_marker_positions_are_found(method: RefinementMethod) -> None:
     settings = RefinementSettings(method, prior=1e-6, huber_m=None, tolerance=1e-14)
     trial = MotionTrial("walk", seen(), 100.0)
     found = refine_markers(misplaced(limb()), [trial], settings)
-    tolerance = 1e-4 if method == "joint" else 1e-3  # descent in turns creeps at the end
+    tolerance = 1e-4 if method == "joint" else 1e-3  # block descent converges slowly
     np.testing.assert_allclose(found.model.positions, limb().positions, atol=tolerance)
 
 
@@ -143,7 +143,7 @@ def test_huber_loss_reduces_the_effect_of_an_outlier_marker() -> None:
     assert off[0.01] < 0.5 * off[None]
 
 
-def test_joint_angles_come_nearer_to_the_truth_when_bone_is_locked() -> None:
+def test_joint_angles_improve_if_markers_on_bone_are_locked() -> None:
     found = refine_markers(misplaced(limb()), [MotionTrial("walk", seen(0.003), 100.0)])
     truth = walk().rotations
     off = [
@@ -154,7 +154,7 @@ def test_joint_angles_come_nearer_to_the_truth_when_bone_is_locked() -> None:
     assert found.trials[0].after.rms < 0.6 * found.trials[0].before.rms
 
 
-def test_a_holdout_ends_the_work_and_gives_the_best_place_back() -> None:
+def test_a_holdout_ends_the_iteration_with_the_best_positions() -> None:
     trial = MotionTrial("walk", seen(0.004), 100.0)
     settings = RefinementSettings(prior=1e-6, holdout_share=0.3)
     found = refine_markers(misplaced(limb()), [trial], settings)
@@ -173,7 +173,7 @@ def clamped() -> ChainModel:
     return replace(model, segments=(model.segments[0], hip, short))
 
 
-def test_markers_suit_a_program_that_clamps_its_joints() -> None:
+def test_with_joint_limits_markers_fit_a_program_that_clamps_its_joints() -> None:
     model, trial = clamped(), MotionTrial("walk", seen(0.002), 100.0)
     model = model.with_locks(dict.fromkeys(model.marker_names[5:], (False,) * 3))
     rms = {}

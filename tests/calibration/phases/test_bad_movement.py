@@ -1,4 +1,4 @@
-"""A limb calibrated on a movement that is not as it should be: a clear verdict, or a right fit."""
+"""Calibration with faulty movements: a rejection with the reason, or a correct fit."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def fit(
     still: bool = False,
     learning: bool = False,
 ) -> Calibration:
-    """Calibrate on a changed movement; `still`: the static pose is changed alike."""
+    """Calibrate with a changed movement; with `still`, the static pose has the same change."""
     static, functional, alignment = trials()
     pose = change(static) if still else static
     settings = LEARNING if learning else QUICK
@@ -58,7 +58,7 @@ def fit(
 
 
 def unplugged(after: float) -> Callable[[CalibrationTrial], CalibrationTrial]:
-    """Return what takes S2 away after a share of the movement."""
+    """Return a function that removes the data of S2 after a share of the movement."""
 
     def change(trial: CalibrationTrial) -> CalibrationTrial:
         track = trial.sensors["S2"]
@@ -70,7 +70,7 @@ def unplugged(after: float) -> Callable[[CalibrationTrial], CalibrationTrial]:
 
 
 def hidden(share: float) -> Callable[[CalibrationTrial], CalibrationTrial]:
-    """Return what hides all markers for a share of the time, 0.25 s at a time."""
+    """Return a function that hides all markers for a share of the time, 0.25 s at a time."""
 
     def change(trial: CalibrationTrial) -> CalibrationTrial:
         optical = trial.optical

@@ -128,7 +128,7 @@ def test_segment_that_fits_worse_on_the_held_out_part_keeps_its_markers() -> Non
     cut = round(0.6 * len(track.t_ns))
     positions = track.positions.copy()
     column = track.markers.index("shank1")
-    # displaced while the refinement uses it, and at its place in the model where it is judged
+    # shank1 is displaced in the training part, and at its correct position in the held-out part
     other = track.markers.index("shank3")
     along = positions[:cut, other] - positions[:cut, column]
     positions[:cut, column] += 0.03 * along / np.linalg.norm(along, axis=1)[:, None]

@@ -1,4 +1,4 @@
-"""The worker's jobs: what a session hands over, and what it gets back."""
+"""Jobs of the worker process: the input of a calibration session, and the result."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ def about_z(angle: float) -> np.ndarray:
 
 
 def mounts() -> dict[str, np.ndarray]:
-    """Return q_sensor_segment of every sensor, as it was put on."""
+    """Return a random q_sensor_segment of every sensor."""
     return {name: rotation.exp(RNG.normal(size=3)) for name in SENSORS}
 
 
 def worlds(angles: dict[str, float]) -> PlateAlignment:
-    """Return an alignment in which every world is turned by its angle about the vertical."""
+    """Return an alignment in which every world is rotated about the vertical by its angle, rad."""
     return PlateAlignment(
         {
             name: AlignedSensor(
@@ -54,7 +54,7 @@ def worlds(angles: dict[str, float]) -> PlateAlignment:
 
 
 def standing(alignment: PlateAlignment, worn: dict[str, np.ndarray]) -> CalibrationTrial:
-    """Return five seconds of all segments upright, as the sensors see it."""
+    """Return a static trial of five seconds with upright segments."""
     t_ns = np.arange(500, dtype=np.int64) * 10_000_000
     tracks = {}
     for name, mount in worn.items():
@@ -67,7 +67,7 @@ def standing(alignment: PlateAlignment, worn: dict[str, np.ndarray]) -> Calibrat
 def said(
     alignment: PlateAlignment, worn: dict[str, np.ndarray], name: str, q: np.ndarray
 ) -> np.ndarray:
-    """Return what a sensor says of a segment at `q`: its world's inverse, then its mount's."""
+    """Return the orientation that a sensor measures on a segment with the orientation `q`."""
     seen = rotation.multiply(rotation.conjugate(np.array(alignment.world(name))), q)
     return np.asarray(rotation.multiply(seen, rotation.conjugate(worn[name])))
 
@@ -81,7 +81,7 @@ def static_job(
 
 
 def test_new_alignment_is_used_at_redonning() -> None:
-    """All sensors were switched off and on: their headings are others, and the plate says which."""
+    """All sensors were switched off and on, so their headings changed between the two poses."""
     before, worn = worlds(dict.fromkeys(SENSORS, 0.3)), mounts()
     pose = fit_static(standing(before, worn), SETTINGS, CHAIN)
     previous = fit_static_only(pose, before, CHAIN)
@@ -97,7 +97,7 @@ def test_new_alignment_is_used_at_redonning() -> None:
         assert item.lag_ns == 4_000_000
 
 
-def test_without_a_new_alignment_the_worlds_stay() -> None:
+def test_without_a_new_alignment_the_worlds_are_unchanged() -> None:
     before, worn = worlds(dict.fromkeys(SENSORS, 0.3)), mounts()
     pose = fit_static(standing(before, worn), SETTINGS, CHAIN)
     previous = fit_static_only(pose, before, CHAIN)
@@ -155,7 +155,7 @@ def test_single_moved_sensor_is_reported_at_a_new_static_pose() -> None:
     assert "S3 and S4 differ by 11.5 deg" in notes[0]
 
 
-def test_a_movement_is_given_the_lags_of_the_calibration_before(
+def test_the_functional_fit_uses_the_lags_of_the_previous_calibration(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     room, worn = worlds(dict.fromkeys(SENSORS, 0.0)), mounts()

@@ -1,4 +1,4 @@
-"""Learning on: better models or none; what is wrong or no better is never taken."""
+"""Online learning: refitted models are used only if they are better than the current models."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def error(one: Calibration, bend: float) -> float:
     return float(np.sqrt(np.mean(off**2)))
 
 
-def test_far_bends_are_learned_and_small_ones_are_not_forgotten(learned: Calibration) -> None:
+def test_large_flexion_is_learned_and_small_flexion_is_not_forgotten(learned: Calibration) -> None:
     assert error(learned, 1.2) < 0.6 * error(calibration(), 1.2)
     assert error(learned, 0.5) < error(calibration(), 0.5) + np.deg2rad(0.3)
 
@@ -121,7 +121,7 @@ def test_memory_is_bounded_and_retains_rare_postures() -> None:
     assert np.count_nonzero(kept.trials == 0) >= 15
 
 
-def test_of_one_posture_the_newest_frames_stay() -> None:
+def test_memory_retains_the_newest_frames_of_a_posture() -> None:
     long = moving(1000, 0.0)
     assert len(np.unique(postures(CHAIN, long), axis=0)) < 10
     both = join_training(long, long)

@@ -1,4 +1,4 @@
-"""The person of the demo, calibrated offline."""
+"""The simulated subject of the demo, calibrated offline."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.experiment
 
 
 @pytest.mark.timeout(180)
-def test_the_demos_person_is_measured_to_three_degrees() -> None:
+def test_the_subject_of_the_demo_is_measured_to_three_degrees() -> None:
     methods: tuple[Method, ...] = ("anchored", "patent12", "mean")
     errors = {method: people(method, (1,))[0] for method in methods}
     assert errors["anchored"].knee <= 3.0

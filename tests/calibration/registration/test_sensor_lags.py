@@ -1,4 +1,4 @@
-"""Which lag a calibration uses: of the plate and the movement, each as far as it is sure."""
+"""Lag of a calibration: plate and movement, weighted by their standard deviations."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def said(lag_ms: float, sigma_ms: float, refused: str | None = None) -> LagEstim
     return LagEstimate(lag_ms * MS, sigma_ms * MS, 0.9, refused)
 
 
-def test_a_plate_beats_skin_and_both_are_surer_than_either() -> None:
+def test_a_plate_lag_outweighs_a_movement_lag_and_both_reduce_the_deviation() -> None:
     chosen = segment_lags({"S1": said(9.0, 1.0)}, {"S1": (round(5 * MS), 0.2 * MS)})["S1"]
     assert chosen.source == "plate and movement"
     assert chosen.lag_ns == pytest.approx(5.0 * MS, abs=0.05 * MS)
@@ -43,7 +43,7 @@ def test_soft_tissue_artefact_increases_the_deviation_of_a_lag() -> None:
 
 
 def test_a_lag_smaller_than_its_deviation_is_noise_and_not_used() -> None:
-    """The recorded squats as bytes: 3.6 ± 4.7 ms for one of a pair, nothing for the other."""
+    """Recorded squats give one sensor of a pair 3.6 ± 4.7 ms, and the other sensor no lag."""
     assert segment_lags({"S1": said(3.6, 4.7)}, {}) == {}
     assert set(segment_lags({"S1": said(3.6, 4.7), "S2": said(15.0, 1.0)}, {})) == {"S2"}
     with_plate = segment_lags({"S1": said(0.5, 4.7)}, {"S1": (100_000, 0.2 * MS)})
@@ -55,7 +55,7 @@ def test_sensor_with_a_plate_lag_corrects_the_soft_tissue_lag_of_its_neighbor() 
     alone = segment_lags(moving, {})["S2"]
     taught = segment_lags(moving, {"S1": (round(5 * MS), 0.1 * MS)})["S2"]
     assert alone.lag_ns == 14 * MS
-    assert 10 * MS < taught.lag_ns < 12 * MS  # S1 showed 4 ms of flesh, most of it shared
+    assert 10 * MS < taught.lag_ns < 12 * MS  # S1 has a soft-tissue bias of 4 ms, most of it common
     assert taught.sigma_ns is not None
     assert alone.sigma_ns is not None
     assert taught.sigma_ns < alone.sigma_ns
@@ -74,7 +74,7 @@ def test_rejected_movement_lag_is_replaced_by_the_plate_lag_unless_the_clock_cha
 def test_lag_errors_on_recorded_skin_are_within_their_deviation(
     name: str, shared_data: Path
 ) -> None:
-    """Truth is the lag put in; flesh moves what is found by milliseconds."""
+    """The true lag is 7 ms by construction; soft tissue biases the estimates by milliseconds."""
     trial = load(shared_data, name)
     period = 20_000_000 if name == "squats1" else 10_000_000
     t_ns = np.arange(len(trial)) * period

@@ -1,4 +1,4 @@
-"""World and mount: found where the movement shows them, refused where it does not."""
+"""Alignment of world and mount: estimated if the movement determines it, otherwise refused."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def off(a: Array, b: Array) -> float:
     return float(rot.angle_between(a, b))
 
 
-def test_a_plate_turned_by_hand_shows_world_and_mount() -> None:
+def test_a_plate_turned_by_hand_determines_world_and_mount() -> None:
     rng = np.random.default_rng(0)
     q_s, q_world, q_mount = walk(rng), rot.exp([2.0, 0.3, -1.0]), rot.exp([-0.4, 1.5, 0.2])
     found = fit_observable_alignment(q_s, body(q_s, q_world, q_mount))
@@ -58,7 +58,7 @@ def test_signs_and_gaps_of_the_streams_do_not_matter() -> None:
     assert off(found.q_world, q_world) < 1e-7
 
 
-def test_the_claimed_error_covers_the_real_one() -> None:
+def test_the_predicted_error_covers_the_actual_error() -> None:
     claimed, real = [], []
     for seed in range(12):
         rng = np.random.default_rng(seed)
@@ -81,7 +81,7 @@ def test_turning_about_one_level_axis_gives_the_heading_only() -> None:
     assert "two or more axes" in found.refused[0]
 
 
-def test_turning_about_the_vertical_shows_no_world_at_all() -> None:
+def test_rotation_about_the_vertical_does_not_determine_the_world() -> None:
     rng = np.random.default_rng(3)
     q_s, q_mount = walk(rng, (0.0, 0.0, 1.0)), rot.exp([0.3, 0.1, 0.2])
     found = fit_observable_alignment(q_s, body(q_s, rot.IDENTITY, q_mount, DEG))
@@ -91,7 +91,7 @@ def test_turning_about_the_vertical_shows_no_world_at_all() -> None:
     assert len(found.refused) == 2
 
 
-def test_two_still_poses_show_no_heading() -> None:
+def test_two_static_poses_do_not_determine_the_heading() -> None:
     poses = np.stack([rot.IDENTITY, rot.heading(1.5)])
     q_s = np.repeat(poses, N // 2, axis=0)
     assert (
@@ -109,7 +109,7 @@ def test_a_heading_fit_never_tilts_the_world() -> None:
     assert np.allclose(tilted.q_world[1:3], 0.0)
 
 
-def test_wild_frames_do_not_turn_the_world() -> None:
+def test_outliers_do_not_rotate_the_world() -> None:
     rng = np.random.default_rng(5)
     q_s, q_world, q_mount = walk(rng), rot.exp([2.0, 0.3, -1.0]), rot.exp([-0.4, 1.5, 0.2])
     q_body = body(q_s, q_world, q_mount, DEG)
@@ -121,6 +121,6 @@ def test_wild_frames_do_not_turn_the_world() -> None:
     assert found.residual_scale < 3 * DEG < found.residual_rms
 
 
-def test_fewer_than_four_frames_are_no_alignment() -> None:
+def test_fewer_than_four_frames_are_refused() -> None:
     with pytest.raises(ValueError, match="four frames"):
         fit_observable_alignment(np.tile(rot.IDENTITY, (3, 1)), np.tile(rot.IDENTITY, (3, 1)))

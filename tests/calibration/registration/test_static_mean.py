@@ -1,4 +1,4 @@
-"""The static mean: truth put in, outliers put in, and what a pose must meet to be accepted."""
+"""Static mean of simulated orientations with outliers, and the acceptance of a static pose."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ def still(spread: float) -> RobustMean:
     return RobustMean(np.asarray(rot.IDENTITY), spread)
 
 
-def test_a_fifth_of_wild_frames_moves_a_robust_mean_less_than_a_plain_one() -> None:
+def test_outliers_change_a_robust_mean_less_than_a_plain_mean() -> None:
     rng = np.random.default_rng(0)
     truth = rot.exp([0.3, -1.2, 0.4])
     q = rot.multiply(truth, rot.exp(DEG * rng.normal(size=(500, 3))))
     q[::5] = rot.multiply(q[::5], rot.exp([0.8, 0.5, 0.0]))
     robust = robust_mean(q * rng.choice([-1.0, 1.0], 500)[:, None])
-    # all of them turned the same way: the worst case for any weighting that keeps them at all
+    # All outliers have the same rotation, which is the worst case for weights above zero.
     assert rot.angle_between(robust.q, truth) < 1.2 * DEG
     assert rot.angle_between(rot.average(q), truth) > 5 * DEG
     assert robust.spread < 3 * DEG
@@ -50,7 +50,7 @@ def test_frames_that_are_unknown_are_left_out() -> None:
         robust_mean(np.full((5, 4), np.nan))
 
 
-def test_the_mount_takes_the_sensor_to_the_segment() -> None:
+def test_the_mount_converts_sensor_to_segment_orientations() -> None:
     rng = np.random.default_rng(1)
     q_segment = rot.exp(rng.normal(0, 0.02, (300, 3)))
     mount = rot.exp([0.2, 0.9, -0.4])
@@ -59,7 +59,7 @@ def test_the_mount_takes_the_sensor_to_the_segment() -> None:
     assert np.allclose(rot.multiply(q_sensor, static_mount(q_sensor, q_segment).q), q_segment)
 
 
-def test_weights_count() -> None:
+def test_a_robust_mean_uses_the_given_weights() -> None:
     q = np.stack([rot.IDENTITY, rot.heading(0.002)])
     assert float(rot.heading_of(robust_mean(q, [3.0, 1.0]).q)) == pytest.approx(0.0005, rel=0.01)
 

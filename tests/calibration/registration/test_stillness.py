@@ -1,4 +1,4 @@
-"""Stillness: made movements whose rests are known, live against recorded, and a real board."""
+"""Detection of rest, live and recorded: simulated movements with known rest, recorded board."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 RATE = 100.0
-REST = slice(0, 500)  # 5 s at rest, then 5 s of swinging, then 1 s of rest: too short to believe
+REST = slice(0, 500)  # 5 s at rest, then 5 s of swinging, then 1 s of rest, which is too short
 SWING = slice(500, 1000)
 
 
