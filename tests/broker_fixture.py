@@ -27,11 +27,11 @@ HOST = os.environ.get("JOINTFIT_TEST_HOST", "127.0.0.1")
 """Address of the loopback; a machine without IPv4 has ``::1`` only."""
 MOSQUITTO_MISSING = "mosquitto is not installed (Debian: apt install mosquitto)"
 CHOICE = "JOINTFIT_TEST_BROKER"
-"""Environment variable with the broker for tests that need no particular one."""
+"""Environment variable that names the broker for tests that accept any broker."""
 
 
 def free_port() -> int:
-    """Return a TCP port of the loopback that nobody listens on just now."""
+    """Return a TCP port of the loopback that no program uses."""
     with socket.socket(socket.AF_INET6 if ":" in HOST else socket.AF_INET) as probe:
         probe.bind((HOST, 0))
         port: int = probe.getsockname()[1]
@@ -44,7 +44,7 @@ def address(port: int) -> str:
 
 
 def wait_for_listener(port: int, within_s: float = 5.0) -> None:
-    """Return once somebody accepts connections on `port` of the loopback."""
+    """Wait until a program accepts connections on `port` of the loopback."""
     until = time.monotonic() + within_s
     while True:
         try:
@@ -99,7 +99,7 @@ class Broker(ABC):
             wait_for_listener(self.port_of(version))
 
     def stop(self) -> None:
-        """Kill the process: connections break and retained messages are forgotten."""
+        """Kill the process: connections break and retained messages are lost."""
         if self._process is not None:
             self.thaw()
             self._process.kill()
@@ -112,7 +112,7 @@ class Broker(ABC):
             self._process.send_signal(signal.SIGSTOP)
 
     def thaw(self) -> None:
-        """Let a frozen process go on."""
+        """Continue a frozen process."""
         if self._process is not None:
             self._process.send_signal(signal.SIGCONT)
 
@@ -202,7 +202,7 @@ import sys
 from iotcore.iotcore import IotCoreBroker
 IotCoreBroker(config_path=sys.argv[1]).run_forever()
 """
-# Not iotcore's own Broker: it keeps its process private, and tests must be able to freeze it.
+# The class Broker of iotcore is not used, because tests cannot freeze its private process.
 
 _CLASSES: dict[str, type[MosquittoBroker | EmbeddedBroker]] = {
     "mosquitto": MosquittoBroker,
@@ -211,10 +211,10 @@ _CLASSES: dict[str, type[MosquittoBroker | EmbeddedBroker]] = {
 
 
 def chosen_broker() -> type[MosquittoBroker | EmbeddedBroker]:
-    """Return the broker for tests that need no particular one.
+    """Return the broker for tests that accept any broker.
 
-    It is the one that the environment variable `CHOICE` names. Without it, mosquitto is taken
-    where it is installed, because users run that; the embedded one otherwise.
+    The environment variable `CHOICE` names the broker. Without the variable, it is mosquitto if
+    mosquitto is installed, because users run mosquitto, and else the embedded broker.
 
     Raises
     ------

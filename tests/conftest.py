@@ -1,4 +1,4 @@
-"""Fixtures every room's tests may use, and the watch over what a test leaves behind."""
+"""Fixtures for all tests, and checks that a test leaves no open file, socket or task."""
 
 from __future__ import annotations
 
@@ -28,32 +28,32 @@ if TYPE_CHECKING:
 
     from tests.broker_fixture import Broker
 
-# The suite draws the same inputs in every run, so that it passes on all machines or on none; new
-# ones are searched with HYPOTHESIS_PROFILE=search and `make fuzz`. No deadline: load may be high.
+# The suite draws the same inputs in every run, so its outcome does not depend on chance. New inputs
+# are searched with HYPOTHESIS_PROFILE=search and `make fuzz`. Load may be high, so there is no
+# deadline.
 settings.register_profile("suite", deadline=None, derandomize=True, max_examples=50)
 settings.register_profile("few", deadline=None, derandomize=True, max_examples=10)
 settings.register_profile("search", deadline=None, max_examples=500)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "suite"))
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the unit has it: read when numpy loads
-# jsonschema imports it for the format `iri`, which our schemas do not use: two seconds of a worker.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in the unit
+# jsonschema would import this module for two seconds, for the unused format `iri`.
 sys.modules.setdefault("rfc3987_syntax", None)  # type: ignore[arg-type]  # None: import fails
 
-# The runner builds all commands anew in each of a thousand calls: 35 ms of processor time.
+# Without the cache, the runner builds all commands in each of a thousand calls, 35 ms each.
 typer.testing._get_command = functools.cache(get_command)  # type: ignore[attr-defined]  # private
 
 PARTS = ("parallel", "alone", "experiments", "experiments-alone")
-"""Which tests run together: by the markers `experiment` and `alone`."""
+"""Groups of tests that run together, defined by the markers `experiment` and `alone`."""
 ONLY_EXPERIMENTS = re.compile(r"^pytestmark = .*\bmark\.experiment\b", re.MULTILINE)
 """Line of a file whose tests are all experiments."""
 EXPERIMENT_TIMEOUT_S = 600.0
-"""Time limit of an experiment without a limit of its own, against hangs only. Experiments that
-compute run at low priority, so that daemons beside them keep their time: they can take ten times as
-long as alone.
+"""Time limit of an experiment without a limit of its own. It ends experiments that hang.
+Experiments that compute run at low priority and may take ten times as long as alone.
 """
 GRACE_S = 6.0
-"""How long descriptors and tasks may take to close: executors, child processes and the task of an
-MQTT client that checks its connection every second end a little later.
+"""Time for descriptors and tasks to close after a test, s. Executors, child processes and the
+connection check of an MQTT client, which runs once per second, end later than the test.
 """
 
 
@@ -78,7 +78,7 @@ def pytest_collection() -> Generator[None, object, object]:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Leave out files with experiments only, unless experiments run: each worker imports files."""
+    """Ignore files that contain experiments only, unless experiments run, to save their import."""
     part = config.getoption("part")
     if part not in {"parallel", "alone"} or collection_path.suffix != ".py":
         return None
@@ -87,7 +87,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Give experiments time, and deselect the tests of the other parts."""
+    """Set the time limit of experiments, and deselect the tests of the other parts."""
     for item in items:
         if item.get_closest_marker("experiment") and not item.get_closest_marker("timeout"):
             item.add_marker(pytest.mark.timeout(EXPERIMENT_TIMEOUT_S))
@@ -109,7 +109,7 @@ def _part_of(item: pytest.Item) -> str:
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """Return the folder of real recordings, which lies beside the project and not in it."""
+    """Return the folder of real recordings, which is not part of the project."""
     folder = Path(__file__).resolve().parents[2] / "shared" / "data"
     if not folder.is_dir():
         pytest.skip(f"real recordings are not here: {folder}")
@@ -130,7 +130,7 @@ def _running(make: Callable[[], Broker], missing: str | None) -> Iterator[Broker
 
 @pytest.fixture
 def broker(tmp_path: Path) -> Iterator[Broker]:
-    """Yield a running broker on free loopback ports: the one that `chosen_broker` returns."""
+    """Yield a running broker of the class that `chosen_broker` returns, on free loopback ports."""
     chosen = chosen_broker()
     with _running(lambda: chosen(tmp_path), chosen.missing()) as running:
         yield running
@@ -138,16 +138,16 @@ def broker(tmp_path: Path) -> Iterator[Broker]:
 
 @pytest.fixture
 def embedded_broker(tmp_path: Path) -> Iterator[Broker]:
-    """Yield a running iotcore, for tests of the broker that comes with pip."""
+    """Yield a running iotcore, the broker that is installed by pip."""
     with _running(lambda: EmbeddedBroker(tmp_path), EmbeddedBroker.missing()) as running:
         yield running
 
 
 @pytest.fixture
 def start_mosquitto(tmp_path: Path) -> Iterator[Callable[[str], Broker]]:
-    """Yield a function that starts a mosquitto with further lines of configuration.
+    """Yield a function that starts a mosquitto with additional lines of configuration.
 
-    For tests of what the embedded broker lacks: TLS, passwords, access lists.
+    The embedded broker does not support TLS, passwords and access lists.
     """
     with contextlib.ExitStack() as brokers:
 
@@ -160,7 +160,7 @@ def start_mosquitto(tmp_path: Path) -> Iterator[Callable[[str], Broker]]:
 
 @pytest.fixture
 def mosquitto(start_mosquitto: Callable[[str], Broker]) -> Broker:
-    """Return a running mosquitto without anything special."""
+    """Return a running mosquitto with the default configuration."""
     return start_mosquitto("")
 
 
@@ -169,7 +169,7 @@ def _open_descriptors() -> set[tuple[str, str]]:
     for name in os.listdir("/proc/self/fd"):  # noqa: PTH208 - names wanted, not paths
         try:
             found.add((name, os.readlink(f"/proc/self/fd/{name}")))  # noqa: PTH115 - need not exist
-        except OSError:  # the descriptor of this very listing
+        except OSError:  # the descriptor of this listing
             continue
     return found
 
@@ -205,7 +205,7 @@ async def tasks_at_the_end() -> AsyncIterator[None]:
 def no_task_outlives_its_test(
     request: pytest.FixtureRequest, no_descriptor_outlives_its_test: None
 ) -> None:
-    """Watch the tasks of asynchronous tests; others get no event loop for it."""
+    """Fail an asynchronous test that leaves a task running; other tests need no event loop."""
     function = getattr(request.node, "obj", None)
     if function is not None and inspect.iscoroutinefunction(function):
         request.getfixturevalue("tasks_at_the_end")

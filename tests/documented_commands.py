@@ -224,7 +224,7 @@ class Shell:
         return files
 
     def _ask(self, script: str) -> str:
-        """Send bash a script that prints one line; return the line."""
+        """Send a script that prints one line to bash; return the line."""
         stdin, stdout = self._process.stdin, self._process.stdout
         assert stdin is not None
         assert stdout is not None

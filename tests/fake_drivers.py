@@ -37,13 +37,13 @@ port = "a"
 host = "127.0.0.1"
 port = {port}
 """
-"""One sensor on one segment; ends in the table of the broker."""
+"""Text of a rig.toml with one sensor on one segment. The last table is that of the broker."""
 
 NAMES = {"fake": "FakeImu", "fakecan": "FakeCanImu", "fakemocap": "FakeMocap"}
 
 
 class FakeSettings(ImuSettings):
-    """A fake IMU on a port; `mood` says how it behaves."""
+    """Settings of a fake IMU on a port; `mood` selects its behaviour."""
 
     port: str = Field(description="name of the port, never opened")
     mood: str = Field("well", description="well | lost | wrong | bug | hang")
@@ -57,20 +57,20 @@ class FakeIds(Settings):
 
 
 class FakeCanSettings(ImuSettings):
-    """A fake IMU on a bus."""
+    """Settings of a fake IMU on a bus."""
 
     can: CanBusSettings = Field(description="its bus")
     ids: FakeIds = Field(default_factory=FakeIds, description="its identifiers")
 
 
 class FakeMocapSettings(MocapSettings):
-    """A fake mocap server."""
+    """Settings of a fake mocap server."""
 
     server: str = Field("127.0.0.1", description="address")
 
 
 class FakeDecoder:
-    """Every byte is one sample that does not move."""
+    """Decoder of a fake IMU: every byte is a sample with the same orientation."""
 
     tick_clock: TickClock | None = None
     discarded_bytes = 0
@@ -79,25 +79,25 @@ class FakeDecoder:
         self.messages = 0
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return one sample a byte."""
+        """Return one sample for each byte."""
         self.messages += len(chunk.data)
         still = (1.0, 0.0, 0.0, 0.0)
         return [ImuSample(chunk.t_ns, still, still, None, byte) for byte in chunk.data]
 
     def flush(self) -> list[Decoded]:
-        """Nothing is ever pending."""
+        """Return nothing, because no byte is ever pending."""
         return []
 
 
 class FakeImu:
-    """Sends a counter byte at its rate."""
+    """An IMU that sends a counter byte at its rate."""
 
     Settings: ClassVar[type[Any]] = FakeSettings
     wire: ClassVar[Wire] = "stream"
     running: ClassVar[list[str]] = []
-    """Ids that run just now, in the order they started."""
+    """Ids of the running devices, in the order of their starts."""
     started: ClassVar[list[str]] = []
-    """Ids ever started."""
+    """Ids of all starts."""
 
     def __init__(self, settings: Any) -> None:
         self._settings = settings
@@ -107,7 +107,7 @@ class FakeImu:
         return FakeDecoder()
 
     async def run(self, emit: Emit) -> None:
-        """Behave as the mood says."""
+        """Send until cancelled, or fail as `mood` requires."""
         match getattr(self._settings, "mood", "well"):
             case "lost":
                 raise DeviceLostError("nobody is there")
@@ -136,7 +136,7 @@ def hang(note: Path) -> None:
 
 
 class FakeCanImu(FakeImu):
-    """The same on a bus."""
+    """A fake IMU on a bus."""
 
     Settings: ClassVar[type[Any]] = FakeCanSettings
 
@@ -160,13 +160,13 @@ class FakeMocap:
 
 
 def entry_points(*, group: str) -> list[EntryPoint]:
-    """Stand in for importlib.metadata.entry_points."""
+    """Replace importlib.metadata.entry_points."""
     module = "tests.fake_drivers"
     return [EntryPoint(name, f"{module}:{cls}", group) for name, cls in NAMES.items()]
 
 
 def install(folder: Path) -> None:
-    """Make `folder`, put on PYTHONPATH, register the fake drivers in another process."""
+    """Write metadata to `folder`, which registers the fake drivers if it is on PYTHONPATH."""
     info = folder / "fake_drivers-0.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: fake-drivers\nVersion: 0\n")

@@ -11,7 +11,7 @@ from tests import fake_drivers
 
 @pytest.fixture
 def fakes(monkeypatch: pytest.MonkeyPatch) -> type[fake_drivers.FakeImu]:
-    """Register the fake drivers, and no other, in this process."""
+    """Register the fake drivers, and no other drivers, in this process."""
     monkeypatch.setattr("jointfit_daemon.driver.entry_points", fake_drivers.entry_points)
     fake_drivers.FakeImu.running.clear()
     fake_drivers.FakeImu.started.clear()
@@ -24,7 +24,7 @@ def _imu(name: str, segment: str) -> dict[str, Any]:
 
 @pytest.fixture
 def table(fakes: type[fake_drivers.FakeImu]) -> dict[str, Any]:
-    """Return a sound rig.toml: four IMUs on a leg, with mocap."""
+    """Return a valid rig.toml: four IMUs on a leg, with mocap."""
     return {
         "rig": {"name": "bench-1"},
         "chain": {"joints": ["hip", "knee", "ankle"], "segments": ["thigh", "shank"]},

@@ -11,7 +11,7 @@ import pytest
 @pytest.fixture
 def lsl() -> Any:
     try:
-        import pylsl  # noqa: PLC0415 - skips where its library is missing
+        import pylsl  # noqa: PLC0415 - the library may be missing
     except (ImportError, RuntimeError, OSError) as missing:
         pytest.skip(f"pylsl cannot be used: {missing}")
     return pylsl
@@ -28,9 +28,9 @@ def receive(lsl: Any, name: str) -> Any:
 
 @pytest.fixture(scope="session")
 def lsl_network() -> Any:
-    """Return pylsl on a host on which a stream can be found."""
+    """Return pylsl; skip the test if this host cannot find LSL streams."""
     try:
-        import pylsl  # noqa: PLC0415 - skips where its library is missing
+        import pylsl  # noqa: PLC0415 - the library may be missing
     except (ImportError, RuntimeError, OSError) as missing:
         pytest.skip(f"pylsl cannot be used: {missing}")
     info = pylsl.StreamInfo("network", "test", 1, 0.0, "double64", f"network-{os.getpid()}")

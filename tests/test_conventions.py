@@ -120,7 +120,7 @@ def test_no_two_classes_share_a_name() -> None:
 
 @pytest.mark.parametrize("family", [Path(package).name for package in PACKAGES])
 def test_private_modules_are_imported_within_their_package_only(family: str) -> None:
-    """`jointfit_drivers.xbus._decoder` is for `jointfit_drivers/xbus` alone."""
+    """For example, only `jointfit_drivers/xbus` may import `jointfit_drivers.xbus._decoder`."""
     crossing = [
         f"{name_of(path)} imports {name}"
         for path in SHIPPED + TOOLING
@@ -135,7 +135,7 @@ UNIT_FACTOR = re.compile(r"^_?(NS|US|MS|MM|NS_PER_M?S|STANDARD_GRAVITY) = ", re.
 
 
 def test_factors_of_unit_conversions_are_defined_once() -> None:
-    """Codecs have factors of their own, because they import the standard library alone."""
+    """Codecs have their own factors, because they import the standard library only."""
     assert [
         name_of(path)
         for path in SHIPPED

@@ -1,4 +1,4 @@
-"""What the pages promise: links lead somewhere, rigs load, commands exist."""
+"""Statements of the pages are true: links have a target, rigs load, commands exist."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Every command that a page prints is run as printed, on sample data, with the services it names.
+"""Every command of a page is run as printed, on sample data, with the services that it needs.
 
-Only this differs from a reader's machine: the broker listens on a free port, which options of
-mosquitto's clients and of ``jointfit-sim play`` name; and the phases of a calibration are short.
+Two things differ from a reader's machine. The broker listens on a free port, which is passed to
+mosquitto's clients and to ``jointfit-sim play``. The phases of a calibration are short.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def shorten_simulations(broker: Broker, home: Path, phases: str = SHORT_PHASES) -> None:
-    """Put a `jointfit-sim` before the real one that names the broker and shortens the phases."""
+    """Install a `jointfit-sim` that calls the real one with the broker's port and short phases."""
     real = shutil.which("jointfit-sim", path=environment(ROOT)["PATH"])
     options = f"--mqtt-host {broker.host} --mqtt-port {broker.port} {phases}"
     (home / "bin").mkdir()
@@ -102,7 +102,7 @@ def shorten_simulations(broker: Broker, home: Path, phases: str = SHORT_PHASES) 
 
 
 def point_clients_at(broker: Broker, home: Path) -> None:
-    """Write the port of the broker where mosquitto's clients look for options."""
+    """Write the port of the broker to the option files of mosquitto's clients."""
     (home / ".config").mkdir()
     for program in ("mosquitto_sub", "mosquitto_pub"):
         options = f"-h {broker.host}\n-p {broker.port}\n-V mqttv5\n"

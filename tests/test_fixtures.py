@@ -1,4 +1,4 @@
-"""The fixtures themselves: brokers answer, and leaks are seen."""
+"""The fixtures: brokers accept connections, and leaks of a test are detected."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_a_broker_listens_for_both_protocol_versions(
         socket.create_connection((broker.host, broker.port_of(version)), timeout=1).close()
 
 
-def test_without_mosquitto_the_embedded_broker_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_mosquitto_the_embedded_broker_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(CHOICE, raising=False)
     monkeypatch.setattr(MosquittoBroker, "PATH", "/nowhere")
     assert chosen_broker() is EmbeddedBroker
@@ -53,7 +53,7 @@ def test_a_broker_can_be_chosen_by_name_and_a_wrong_name_is_refused(
 
 
 @pytest.mark.parametrize("complaint", LEAKS)
-def test_a_test_that_leaks_is_failed(complaint: str, tmp_path: Path) -> None:
+def test_a_test_with_a_leak_fails(complaint: str, tmp_path: Path) -> None:
     (tmp_path / "test_leak.py").write_text(LEAKS[complaint], encoding="utf-8")
     options = ["-p", "tests.conftest", "-p", "no:cacheprovider", "--rootdir", str(tmp_path)]
     ran = subprocess.run(

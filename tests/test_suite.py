@@ -72,7 +72,7 @@ def test_a_measurement_that_fails_is_repeated_once_and_named(
     capsys: pytest.CaptureFixture[str],
     repeated: int,
 ) -> None:
-    """A pause of the machine disturbs a measurement of time that runs alone."""
+    """A pause of the machine can disturb a time measurement, even if the test runs alone."""
     calls: list[str] = []
 
     def run(part: str, reports: Path, arguments: list[str], report: str = "") -> int:

@@ -1,4 +1,4 @@
-"""Comparison of compiled modules and sources: the process of one variant, and a missing tree."""
+"""Comparison of compiled modules and sources: the measuring process, and missing modules."""
 
 from __future__ import annotations
 

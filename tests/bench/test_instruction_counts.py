@@ -1,4 +1,4 @@
-"""Instructions of the frame's path: what is counted, and that no part has grown."""
+"""Instruction counts of a frame: which instructions count, and that no count has grown."""
 
 from __future__ import annotations
 

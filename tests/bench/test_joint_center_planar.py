@@ -26,6 +26,6 @@ def test_planar_center_experiment_meets_its_thresholds(experiment: Experiment) -
     ("n", "arc", "noise"),
     [(100, 19, 0.002), (100, 90, 0.002), (30, 30, 0.002), (15, 45, 0.002), (60, 90, 0.02)],
 )
-def test_published_ellipses_hold_the_truth_19_times_in_20(n: int, arc: float, noise: float) -> None:
+def test_95_percent_ellipses_contain_the_true_center(n: int, arc: float, noise: float) -> None:
     found = runs_on(n, arc, noise, runs=4000, correlated=True)
     assert 0.93 <= share_covered(found, n) <= 0.97

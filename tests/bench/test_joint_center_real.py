@@ -1,4 +1,4 @@
-"""A real trial through the bench that prints it: where recordings and the model's program are."""
+"""Joint centers of a recorded trial; the test needs the recordings and OpenSim."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_predicted_error_of_a_recorded_joint_center_is_not_much_too_small(tmp_pa
     reason = row.missing()
     if reason is not None:
         pytest.skip(reason)
-    # a process of its own: the model's program prints and warns as it likes
+    # in a separate process, because OpenSim prints messages and warnings
     script = [sys.executable, "-m", "bench", NAME, "--dry-run"]
     done = subprocess.run(
         [*script, "--json", str(tmp_path / "a.json")], cwd=ROOT, capture_output=True, check=False
@@ -37,7 +37,7 @@ def test_predicted_error_of_a_recorded_joint_center_is_not_much_too_small(tmp_pa
     for joint in joints:
         stated = figures[f"{joint}: stated error"]
         stated_across = figures[f"{joint}: stated error across the axis"]
-        # the model's own center moves 4 to 18 mm under the markers
+        # the center of the model moves by 4 to 18 mm relative to the markers
         across = figures[f"{joint}: distance to the model across the axis"]
         assert across < 2.0 * stated_across + 18.0
         assert figures[f"{joint}: distance to the model"] < 2.0 * stated + 18.0

@@ -1,4 +1,4 @@
-"""Stacks of a sampler count for the part of the program that was at work."""
+"""Sampled stacks are assigned to the part of the program that was running."""
 
 from __future__ import annotations
 
@@ -27,7 +27,9 @@ FEED = *MAIN, "Core.feed (jointfit_daemon/pipeline/_core.py:200)"
         (FEED, "core and supervisor"),
     ],
 )
-def test_the_innermost_function_of_the_project_decides(stack: tuple[str, ...], part: str) -> None:
+def test_a_stack_counts_for_the_innermost_function_of_the_project(
+    stack: tuple[str, ...], part: str
+) -> None:
     assert part_of(stack).startswith(part)
 
 

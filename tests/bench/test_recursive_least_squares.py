@@ -1,4 +1,4 @@
-"""Recursive fits against their batch forms, and their guards."""
+"""Recursive fits, compared with batch fits, and their limits during rest."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_without_forgetting_recursive_is_ridge_regression() -> None:
     assert np.allclose(sums.coefficients, batch, atol=1e-11)
 
 
-def test_forgetting_follows_a_change_and_remembering_does_not() -> None:
+def test_a_fit_follows_a_change_only_with_forgetting() -> None:
     rng = np.random.default_rng(1)
     quick, slow = RecursiveLeastSquares(2, 1, 1e-3, 0.98), RecursiveLeastSquares(2, 1, 1e-3)
     for i in range(1000):
@@ -38,7 +38,7 @@ def test_forgetting_follows_a_change_and_remembering_does_not() -> None:
 
 
 @pytest.mark.experiment
-def test_standing_still_for_an_hour_does_not_wind_the_estimate_up() -> None:
+def test_an_hour_of_rest_does_not_make_the_fit_unstable() -> None:
     rng = np.random.default_rng(2)
     tracker = RecursiveLeastSquares(2, 1, 1e-3, 0.999)
     for _ in range(500):
@@ -52,7 +52,7 @@ def test_standing_still_for_an_hour_does_not_wind_the_estimate_up() -> None:
     assert np.isfinite(tracker.coefficients).all()
 
 
-def test_a_lighter_sample_moves_the_estimate_less() -> None:
+def test_a_sample_with_a_smaller_weight_changes_the_fit_less() -> None:
     light, heavy = RecursiveLeastSquares(1, 1, 1.0), RecursiveLeastSquares(1, 1, 1.0)
     light.feed([1.0], [1.0], 0.1)
     heavy.feed([1.0], [1.0], 1.0)

@@ -1,4 +1,4 @@
-"""The ten-hour row in short form, and that it would notice a leak."""
+"""The ten-hour memory experiment in short form, and its detection of a leak."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from bench.experiments.timing.memory import Held, growth, held, watch
 
 KIB = 1024
 FULL_H = 0.06
-"""Minute-long windows are full, two minutes of echoes too."""
+"""Time after which windows of a minute and echoes of two minutes are full, h."""
 
 
 @pytest.mark.experiment
@@ -18,7 +18,7 @@ def test_core_memory_does_not_grow_in_a_quarter_of_an_hour() -> None:
     assert samples > 20_000
     assert states > 4_000
     assert len(sizes) > 4
-    assert max(sizes) - min(sizes) < 16 * KIB  # eight bytes a sample would be 170
+    assert max(sizes) - min(sizes) < 16 * KIB  # a leak of 8 bytes per sample would be 170 KiB
 
 
 def test_memory_experiment_measures_size_and_growth() -> None:

@@ -1,4 +1,4 @@
-"""The pictures of a run show what happened in it, simulated or recorded, and need matplotlib."""
+"""Plots of simulated and recorded runs show their events; these tests need matplotlib."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def _at(trace: Trace, t_s: float) -> int:
 
 @pytest.mark.experiment
 def test_a_recorded_run_is_drawn_like_a_simulated_one(tmp_path: Path) -> None:
-    """In a process of its own: matplotlib keeps its fonts open."""
+    """The plots are drawn in a separate process, because matplotlib keeps font files open."""
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
     log = write_recording(tmp_path / "recordings", simulated(12.0).events)
     pictures = tmp_path / "pictures"
@@ -79,7 +79,7 @@ def test_a_recorded_run_is_drawn_like_a_simulated_one(tmp_path: Path) -> None:
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=300.0,  # at low priority beside daemons
+        timeout=300.0,  # at low priority, so that daemons of other tests are not delayed
         check=False,
     )
     assert ran.returncode == 0, ran.stderr

@@ -196,7 +196,7 @@ async def measure(
                 row = {"samples": float(received(listener))}
                 row |= process_values(child.process.pid, folder / "counts")
                 row |= daemon_values(listener, movement, unix_ns)
-                if not any(map(math.isnan, row.values())):  # otherwise, this machine paused
+                if not any(map(math.isnan, row.values())):  # NaN: this machine paused
                     found.append(row)
                     append(row, options.out)
     finally:

@@ -35,7 +35,7 @@ the samples of 16 ms together."""
 BATCH = RATE_HZ
 """Largest number of samples in one transmission: a second of accelerated time."""
 SLOW_WAKES = 20
-"""Number of successive transmissions with skipped samples that mean a machine too slow."""
+"""Number of successive transmissions with skipped samples after which the machine is too slow."""
 TURN_RAD_S = 0.8
 """Angular frequency of the movement, rad/s; its amplitude is 1 rad."""
 

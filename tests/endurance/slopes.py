@@ -1,9 +1,9 @@
 """Slopes of measured values over a long run, with their intervals of 95 % joint confidence.
 
 Neighbouring values depend on each other, so the line is fitted to the lower quartiles of a few
-blocks, whose lengths exceed that dependence. A leak or a backlog of the daemon raises all values of
-a block, another program of this machine raises some. The first part of the run, in which caches
-fill, is left out.
+blocks, which are longer than this dependence. A leak or a backlog of the daemon increases all
+values of a block; another program of this machine increases some values. The first part of the run,
+in which caches fill, is left out.
 
 Invariant: of twenty runs without growth, about one has a slope in any of its quantities.
 """
@@ -30,7 +30,7 @@ slow for the factor, so the run has not tested normal operation."""
 LEAST_SAMPLES = 10_000_000
 """Number of samples below which buffers are still filling, so that slopes prove nothing."""
 BLOCKS = 12
-"""Number of quartiles to which the line is fitted."""
+"""Number of blocks. The line is fitted to the lower quartile of each block."""
 WARM_UP = 0.25
 """Share of the run that is left out."""
 FALSE_ALARMS = 0.05
@@ -44,7 +44,7 @@ class Slope:
     per_million: float
     """Slope, units per million samples."""
     half_width: float
-    """Half width of its interval."""
+    """Half width of the interval of the slope."""
     mean: float
 
     @property
@@ -110,7 +110,8 @@ def outcomes_of(results: dict[str, Any]) -> str:
 def faults_of(results: dict[str, Any]) -> list[str]:
     """Return the values that grow or are wrong."""
     faults = [
-        f"{name} has a slope of {slope['per_million']:+.3g} ± {slope['half_width']:.2g} per million"
+        f"{name} has a slope of {slope['per_million']:+.3g} ± {slope['half_width']:.2g}"
+        " per million samples"
         for name, slope in results["slopes"].items()
         if abs(slope["per_million"]) > slope["half_width"]
     ]

@@ -1,4 +1,4 @@
-"""A leak is found in the noise of a run; a run without one has the slope zero."""
+"""A leak is detected in spite of noise; a run without a leak has the slope zero."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SAMPLES = np.linspace(0.0, 5e6, 400)
 
 
 def noise(seed: int) -> NDArray[np.float64]:
-    """Return values of which each depends on the one before, as the memory of a process does."""
+    """Return noise in which each value depends on the previous value, like process memory."""
     draws, found = np.random.default_rng(seed).normal(size=len(SAMPLES)), np.zeros(len(SAMPLES))
     for k in range(1, len(found)):
         found[k] = 0.5 * found[k - 1] + draws[k]

@@ -1,4 +1,4 @@
-"""A stand-in for the daemon: publishes what its own encoders write, ten times a second."""
+"""Replacement for the daemon, which publishes a pose with the daemon's encoders at 10 Hz."""
 
 from __future__ import annotations
 

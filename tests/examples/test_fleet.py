@@ -32,7 +32,7 @@ pytestmark = pytest.mark.skipif(
 
 
 class RecordingClient:
-    """A client that keeps all messages which it receives."""
+    """A client that stores all received messages."""
 
     def __init__(self, port: int, user: str | None = None) -> None:
         self.messages: list[tuple[str, bytes]] = []
@@ -152,7 +152,7 @@ def test_events_wait_for_the_station_and_retained_states_return_after_its_restar
             until(lambda: (f"{BASE}/link", b"1") in viewer.messages)
         daemon.publish(f"{BASE}/bridge/state", b"online", retain=True)
 
-        station.stop()  # it forgets everything
+        station.stop()  # it loses all retained messages
         for number in range(3):
             daemon.publish(f"{BASE}/bridge/event", b"%d" % number)
         station.start()

@@ -1,4 +1,4 @@
-"""Minimal publisher with aiomqtt, connected again as its documentation describes: a peer.
+"""Minimal publisher with aiomqtt that reconnects as the documentation of aiomqtt describes.
 
 ``python -m tests.faults.aiomqtt_publisher HOST PORT TOPIC PAUSE`` publishes a number 100 times a
 second. After an error it waits PAUSE seconds. It prints ``lost`` for each error.

@@ -1,7 +1,7 @@
-"""A TCP proxy between the daemon and the broker: slow, or with lost segments.
+"""A TCP proxy between the daemon and the broker, which is slow or simulates lost segments.
 
-It stands where the kernel offers no netem: TCP repairs a lost segment by a pause, which this proxy
-makes. Other clients of the broker pass it without a fault.
+The proxy is used because not every kernel has netem. TCP repairs a lost segment after a pause, and
+the proxy makes this pause. The connections of other clients have no fault.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 _CHUNK = 4096
 """Bytes that are passed on at once."""
 _BUFFER = 16_384
-"""Receive buffer of the proxy, bytes: behind it the daemon's own buffers fill."""
+"""Receive buffer of the proxy, bytes. If it is full, the buffers of the daemon fill."""
 _TIMEOUT_S = 0.2
 """Shortest time after which Linux sends a lost segment again, s; doubled at each repetition."""
 _WILL = b"bridge/state"
-"""Occurs in the first packet of the daemon alone: its will."""
+"""Topic of the will, which only the first packet of the daemon contains."""
 
 
 @dataclass
@@ -75,7 +75,7 @@ class FaultyLink:
 
 @contextlib.asynccontextmanager
 async def faulty_link(gateway: Gateway) -> AsyncIterator[FaultyLink]:
-    """Put the proxy in the place of the broker, without a fault at first; remove it at the end."""
+    """Replace the broker by the proxy, at first without a fault; remove the proxy at the end."""
     behind = chosen_broker()(gateway.folder)
     gateway.broker.stop()
     behind.start()

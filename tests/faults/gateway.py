@@ -239,7 +239,7 @@ class Gateway:
     async def request(self, name: str, **arguments: object) -> dict[str, Any]:
         """Send a request; return the answer."""
         assert self.listener.client is not None
-        # Fast successive scenarios would exceed the limit of ten requests per second.
+        # Without the pause, fast scenarios would exceed the limit of ten requests per second.
         await asyncio.sleep(REQUEST_PAUSE_S)
         answer: dict[str, Any] = await self.listener.client.request(name, arguments)
         return answer

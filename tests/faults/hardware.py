@@ -33,11 +33,11 @@ if TYPE_CHECKING:
 PERIOD_S = 0.01
 MARKERS = ("T1", "T2", "T3")
 FAR_NS = 1_000_000_000_000
-"""Age of the server's clock when a recording on it began, ns."""
+"""Time of the server's clock at the start of a recording, ns."""
 
 
 class CameraServer(NatNetServer):
-    """Server whose description may contain a skeleton, and that may receive nothing."""
+    """Server with a skeleton in its description, or behind a firewall, if a test requires it."""
 
     firewall = False
     """Whether datagrams in both directions are dropped without an answer."""

@@ -30,8 +30,8 @@ def table_of(results: dict[str, Any]) -> str:
     text = "\n".join(rows)
     if counts := results["gpsd_flood"]:
         text += (
-            f"\n\nA line of 921 600 baud, filled with position sentences for {FLOOD_S:g} s: gpsd "
-            f"reported {counts['received']} of {counts['sent']}."
+            f"\n\nWhen a line of 921 600 baud was filled with position sentences for {FLOOD_S:g} s,"
+            f" gpsd reported {counts['received']} of {counts['sent']} sentences."
         )
     return text
 

@@ -1,7 +1,7 @@
 """The same faults for the daemon and for other programs: ``make faults ARGS=--peers``.
 
-A minimal publisher with aiomqtt meets the faults of the broker, and gpsd those of serial input. All
-of them run beside the daemon and meet each fault at the same instant.
+A minimal publisher with aiomqtt has the faults of the broker, and gpsd has the faults of serial
+input. All programs run at the same time as the daemon, and each fault affects all at the same time.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ Figures = dict[str, dict[str, list[float]]]
 
 
 class MessageTimes:
-    """Subscriber that notes when each topic last arrived; it connects again within 10 ms."""
+    """Subscriber that stores the last arrival time of each topic; it reconnects within 10 ms."""
 
     def __init__(self, port: int, topics: dict[str, str]) -> None:
         self._port, self._names = port, {topic: name for name, topic in topics.items()}
@@ -50,7 +50,7 @@ class MessageTimes:
         """Monotonic time of the last message of each program, s."""
 
     async def run(self) -> None:
-        """Note messages until cancelled."""
+        """Receive messages until cancelled."""
         while True:
             with contextlib.suppress(aiomqtt.MqttError):
                 async with aiomqtt.Client(HOST, self._port, timeout=2.0) as client:
@@ -101,7 +101,7 @@ async def meet_broker_faults(gateway: Gateway, repeat: int, found: Figures) -> N
             await times.recovered(20.0)
             for _ in range(repeat):
                 gateway.broker.stop()
-                await asyncio.sleep(OUTAGE_S + random.random())  # else in phase with a pause
+                await asyncio.sleep(OUTAGE_S + random.random())  # not in phase with a pause
                 gateway.broker.start()
                 for name, value_s in (await times.recovered(30.0)).items():
                     found["publishing after the broker returned"][name].append(value_s)

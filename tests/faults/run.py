@@ -48,8 +48,8 @@ async def run_all(
 ) -> list[str]:
     """Run scenarios, each `repeat` times in a row; add the outcomes of each.
 
-    Those of one kind of gateway share a daemon: a fault must leave nothing behind. Only a failure
-    is followed by another daemon.
+    Scenarios with the same kind of gateway share a daemon, because a fault must have no lasting
+    effect. After a failure, another daemon is started.
 
     Returns
     -------
@@ -90,7 +90,7 @@ async def _run_repeatedly(
     began_s = time.monotonic()
     for _ in range(repeat):
         outcome = await scenario.run(gateway)
-        found.append(outcome)  # not at the end alone: an interrupted series has results, too
+        found.append(outcome)  # at once, for the results of an interrupted series
     recovered_s = statistics.median(outcome.recovered_s for outcome in found)
     took_s = time.monotonic() - began_s
     print(f"{name}: recovered in {recovered_s:.2f} s; took {took_s:.0f} s", flush=True)

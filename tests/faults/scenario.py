@@ -1,4 +1,4 @@
-"""What a fault scenario is, and its result."""
+"""Classes of fault scenarios and their results."""
 
 from __future__ import annotations
 
@@ -11,27 +11,28 @@ if TYPE_CHECKING:
     from tests.faults.gateway import Gateway
 
 Kind = Literal["serial", "all", "host"]
-"""Gateways: two serial sensors; these, a CAN sensor and cameras; with a disk and clock of its own.
+"""Kinds of gateways: two serial sensors; two serial sensors, a CAN sensor and cameras; two serial
+sensors with a disk and a clock of their own.
 """
 
 
 def nothing_missing() -> str | None:
-    """Return None: the scenario runs everywhere."""
+    """Return None, because the scenario runs on every machine."""
     return None
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """One run of a scenario."""
+    """Result of one run of a scenario."""
 
     noticed_s: float
     """Time from the fault to its report, s."""
     recovered_s: float
-    """Time from the end of the fault to the first pose as before, s."""
+    """Time from the end of the fault to the first pose that is as before the fault, s."""
     pose_gap_s: float
-    """Longest time between two poses meanwhile, s."""
+    """Longest time between two poses during the run, s."""
     lost: int
-    """Samples, messages or poses that were lost; the scenario names them and their counter."""
+    """Number of lost samples, messages or poses, as described by `Scenario.counted`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,9 +43,9 @@ class Scenario:
     reported: str
     """Where the fault is reported."""
     continues: str
-    """What continues meanwhile."""
+    """Functions that continue during the fault."""
     counted: str
-    """What is lost, and where it is counted."""
+    """Data that are lost, and the counter of the loss."""
     run: Callable[[Gateway], Awaitable[Outcome]]
     noticed_limit_s: float
     recovered_limit_s: float
@@ -53,12 +54,12 @@ class Scenario:
     gap_limit_s: float | None = None
     """Limit of the time between two poses, s; None if poses stop."""
     kind: Kind = "serial"
-    """Gateway that it needs."""
+    """Kind of gateway that the scenario needs."""
     missing: Callable[[], str | None] = nothing_missing
-    """Returns why it cannot run on this machine; None if it can."""
+    """Returns the reason why the scenario cannot run on this machine; None if it can run."""
 
     def faults(self, outcome: Outcome, factor: float = 1.0) -> list[str]:
-        """Return the limits that `outcome` exceeds; `factor` is that of a loaded machine."""
+        """Return the exceeded limits; each limit is multiplied by the load factor `factor`."""
         measured = (
             ("noticed", outcome.noticed_s, self.noticed_limit_s),
             ("recovered", outcome.recovered_s, self.recovered_limit_s),

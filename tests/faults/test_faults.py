@@ -1,4 +1,4 @@
-"""Every fault is reported and overcome within its limits; the page shows the stored results."""
+"""The daemon reports every fault and recovers within limits; the page has the stored results."""
 
 from __future__ import annotations
 

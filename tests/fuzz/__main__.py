@@ -1,13 +1,13 @@
-"""Coverage-guided fuzzing of every entrance: ``make fuzz``.
+"""Coverage-guided fuzzing of every input of the program: ``make fuzz``.
 
 Each target runs in two processes, one after the other. The first is guided by coverage (atheris,
 libFuzzer) and collects the inputs that reach new code in build/fuzz/corpus/TARGET, where the next
 run continues. The second changes these inputs at random without coverage, which is about five times
-faster. A finding is stored under build/fuzz/TARGET/ and fuzzing goes on. The exit code is 1 if
+faster. A finding is stored under build/fuzz/TARGET/, and fuzzing continues. The exit code is 1 if
 there was a finding.
 
-To instrument the modules takes ten seconds, more than a short run of a target. Therefore the guided
-processes are forks of one process a job, which has imported everything.
+The instrumentation of the modules takes ten seconds, longer than a short run of a target. Each job
+therefore has one process that imports all modules, and the guided processes are its forks.
 """
 
 from __future__ import annotations
@@ -238,7 +238,7 @@ def run_target(
 
 def start_guided_server() -> subprocess.Popen[str]:
     """Start the process of `serve_guided`."""
-    with (OUT / f"{GUIDED}.log").open("ab") as log:  # it lists all instrumented modules
+    with (OUT / f"{GUIDED}.log").open("ab") as log:  # libFuzzer lists all instrumented modules
         return subprocess.Popen(
             [sys.executable, "-m", "tests.fuzz", "--serve-guided"],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True, env=ENVIRONMENT,

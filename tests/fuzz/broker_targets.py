@@ -81,7 +81,7 @@ def folder() -> Path:
 
 @cache
 def guards() -> tuple[RequestAuthenticator | None, ...]:
-    """Return the request authenticators: none, and one with a key."""
+    """Return the two cases of authentication: None without a key, and an authenticator."""
     key_file = folder() / "request.key"
     key_file.write_bytes(KEY)
     key_file.chmod(0o600)

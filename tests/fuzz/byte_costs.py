@@ -12,11 +12,12 @@ if TYPE_CHECKING:
     from tests.fuzz.target import Target
 
 LEAST_BYTES = 256
-"""Shortest input that is compared: the time of a shorter one is mostly that of the new decoder."""
+"""Shortest compared input, bytes. For shorter inputs, creating the decoder takes most of the time.
+"""
 STEEPEST = 20.0
-"""The worst byte may cost this many times the median byte."""
+"""Largest accepted ratio of the worst to the median time per byte."""
 SETTLED = 1_000
-"""Inputs after which the median is used."""
+"""Number of inputs after which the median is used."""
 _BINS = 16
 """Bins of the histogram for each factor of two."""
 
@@ -24,12 +25,12 @@ _BINS = 16
 class ByteCosts:
     """Median and worst processor time per byte.
 
-    The worst input is repeated and its least time counts, without pauses of the machine.
+    The worst input is repeated, and its shortest time counts, because the machine may pause.
 
     Parameters
     ----------
     target : Target
-        Entrance that the inputs were given to.
+        Target that receives the inputs.
     """
 
     def __init__(self, target: Target) -> None:
@@ -39,7 +40,7 @@ class ByteCosts:
         """Processor time of the worst byte, s."""
 
     def add(self, data: bytes, seconds: float) -> str:
-        """Add one input; return a finding if its bytes cost too much."""
+        """Add one input; return a finding if its time per byte is too long, else an empty text."""
         if len(data) < LEAST_BYTES:
             return ""
         per_byte = max(seconds, 1e-9) / len(data)

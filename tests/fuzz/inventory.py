@@ -34,9 +34,9 @@ DECODERS = frozenset(
     for target in module.TARGETS
     if module not in _FILES and not target.name.endswith(_NO_DECODERS)
 )
-"""Targets that decode the bytes of a device: their cost per byte is even."""
+"""Targets that decode the bytes of a device. Their time per byte must be nearly constant."""
 REPRODUCERS = Path(__file__).parent / "reproducers"
-"""One folder a target; every input in it failed once, and must not fail again."""
+"""Folder with one folder for each target. Every input in it failed once and must not fail again."""
 
 
 def reproducers(name: str) -> list[Path]:

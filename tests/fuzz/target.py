@@ -1,7 +1,8 @@
-"""What a fuzz target is, and the limits that every case must meet.
+"""Fuzz targets, and the limits that every case must meet.
 
-A case is one input to one entrance of the program. It may raise the documented exceptions of that
-entrance and no other. Its processor time is bounded per byte, and so is the memory it adds.
+A target is an interface of the program that receives data from outside. A case is one input to a
+target. It may raise only the exceptions that are documented for the target. Its processor time per
+byte and its additional memory are limited.
 """
 
 from __future__ import annotations
@@ -17,13 +18,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 LEAST_S = 0.15
-"""Processor time that a case of any size may take, s: poses may pause for 0.2 s."""
+"""Processor time that a case of any size may take, s. Poses may pause for 0.2 s."""
 PER_BYTE_S = 100e-6
-"""Processor time beyond it for each byte, s: under coverage all code runs several times slower."""
+"""Additional processor time per byte, s. Measuring coverage slows the code down several times."""
 MOST_GROWTH = 20_000_000
-"""Resident memory that one case may add to that before it, bytes."""
+"""Largest increase of the resident memory in one case, bytes."""
 REPEATS = 3
-"""Repetitions of a case that cost too much, of which the cheapest counts."""
+"""Number of repetitions of a case that exceeded a limit. The smallest value counts."""
 
 
 class UnaccountedError(AssertionError):
@@ -32,23 +33,23 @@ class UnaccountedError(AssertionError):
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """One entrance.
+    """One interface that is fuzzed.
 
     Attributes
     ----------
     name : str
-        For the table, the corpus and the reproducers.
+        Name in the table, and of the folders of corpus and reproducers.
     run : callable
-        Takes one input through the entrance.
+        Function that processes one input.
     seeds : callable
-        Valid inputs made by the simulators.
+        Function that returns valid inputs.
     refusals : tuple of type
         Exceptions that are documented for bad input.
     share : float
         Share of the cases of a run, relative to the other targets.
     longest : int
-        Largest input under coverage, bytes, or that of the largest seed. Short inputs reach the
-        same code in less time; the tests run long ones.
+        Largest input under coverage, bytes, or the size of the largest seed. Short inputs reach the
+        same code in less time; the tests use long inputs.
     """
 
     name: str
@@ -61,20 +62,20 @@ class Target:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What one case did."""
+    """Result of one case."""
 
     seconds: float
     growth: int
     finding: str
-    """Empty, or the reason of a failure: its first line identifies it."""
+    """Reason of a failure, whose first line identifies it; empty without a failure."""
 
 
 def run_case(target: Target, data: bytes) -> Outcome:
-    """Run one case and return what it cost and whether it failed."""
+    """Run one case and return its result."""
     seconds, growth, finding = measure_case(target, data)
     allowed_s = LEAST_S + PER_BYTE_S * len(data)
     if not finding and seconds > allowed_s:
-        # A first slow case may pay for an import or a garbage collection.
+        # The first run of a case may contain an import or a garbage collection.
         seconds = min(measure_case(target, data)[0] for _ in range(REPEATS))
         if seconds > allowed_s:
             finding = f"slow: {seconds:.2f} s for {len(data)} bytes, allowed {allowed_s:.2f} s"
@@ -93,7 +94,7 @@ def measure_case(target: Target, data: bytes) -> tuple[float, int, str]:
         target.run(data)
     except target.refusals:
         pass
-    except Exception as error:  # noqa: BLE001 - whatever else comes is what is looked for
+    except Exception as error:  # noqa: BLE001 - all other exceptions are findings
         finding = _described(error)
     return time.process_time() - began, _largest_bytes() - before, finding
 

@@ -1,4 +1,4 @@
-"""Cost per byte over the inputs of a target: the median, and a worst byte that costs too much."""
+"""Processor time per byte over the inputs of a target: the median, and findings."""
 
 from __future__ import annotations
 

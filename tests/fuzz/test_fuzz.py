@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 EXAMPLES = 15
 MUTANTS = 40
 PER_BYTE = [name for name in TARGETS if not name.endswith("-core")]
-"""Targets whose cost follows the bytes; that of the core follows the time that passes, too."""
+"""Targets whose cost depends on the bytes only. The cost of the core also depends on the time."""
 SHORT = 15_000
-"""Bytes of the shorter of two inputs whose times are compared; the other has four times as many."""
+"""Size of the shorter of two inputs, bytes. The longer input has four times this size."""
 STEEPEST = 8.0
-"""Four times the bytes may cost this many times the time: linear is 4, quadratic 16."""
+"""Largest ratio of the times of the two inputs. Linear time has the ratio 4, quadratic time 16."""
 FAILED_ONCE = [path for name in TARGETS for path in reproducers(name)]
 
 
@@ -83,7 +83,7 @@ def fault(data: bytes) -> None:
         raise UnaccountedError("4 bytes, 3 in messages or discarded")
     if data.startswith(b"slow"):
         sum(range(30_000_000))
-    if data.startswith(b"large"):  # 154 MB, less what this process has released before
+    if data.startswith(b"large"):  # 154 MB minus memory that this process released before
         bytes(range(256)) * 600_000
 
 

@@ -75,7 +75,7 @@ def cycled(points: Array, *labels: str) -> Array:
 
 
 def centers_of(clusters: list[MarkerCluster]) -> dict[tuple[str, str], Array]:
-    """Return the joint centers beside standing clusters, static world, m, shape (3,)."""
+    """Return the joint centers of standing clusters in the static world, m, shape (3,) each."""
     # All segment frames of the standing limb have the same axes.
     pelvis, local = clusters[0], np.array(LOCAL["pelvis"])
     q, t, _ = rigid_fit(local, (pelvis.template + pelvis.origin)[None])
@@ -83,7 +83,7 @@ def centers_of(clusters: list[MarkerCluster]) -> dict[tuple[str, str], Array]:
 
 
 def calibration_of(clusters: list[MarkerCluster]) -> Calibration:
-    """Return a calibration with these clusters and the joint centers beside them."""
+    """Return a calibration with these clusters and their joint centers."""
     found = centers_of(clusters)
     joints = {
         name: JointCalibration(vector(center), 0.0, "fit")

@@ -1,4 +1,4 @@
-"""A complete calibration of any chain, without models: what a static pose leaves."""
+"""A complete calibration of any chain without models, like the result of a static pose."""
 
 from __future__ import annotations
 

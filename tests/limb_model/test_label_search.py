@@ -1,4 +1,4 @@
-"""Exchanged labels are found by the shapes of the clusters, or not at all."""
+"""Exchanged labels are found by the shapes of the clusters; healthy labels cause no finding."""
 
 from __future__ import annotations
 

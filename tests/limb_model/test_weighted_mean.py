@@ -28,7 +28,7 @@ def test_two_sensors_in_closed_form_are_the_eigenvector(
 ) -> None:
     found = fuse_one((p, q), (a, b))
     M = a * np.outer(p, p) + b * np.outer(q, q)
-    # the largest quadratic form is the claim; the eigenvector itself is loose where p and q oppose
+    # Compare the quadratic form: the eigenvector is ill-conditioned for almost opposite p, q.
     assert np.array(found) @ M @ np.array(found) == pytest.approx(
         np.linalg.eigvalsh(M)[-1], rel=1e-12
     )
@@ -36,7 +36,7 @@ def test_two_sensors_in_closed_form_are_the_eigenvector(
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
-def test_any_number_of_sensors_fuses_the_same_frame_by_frame(count: int) -> None:
+def test_fusion_frame_by_frame_equals_fusion_of_arrays(count: int) -> None:
     rng = np.random.default_rng(count)
     truth = rot.normalize(rng.normal(size=(50, 4)))
     sensors = [rot.multiply(truth, rot.exp(rng.normal(0, 0.1, (50, 3)))) for _ in range(count)]

@@ -116,7 +116,7 @@ class Inputs:
 
     @property
     def sent(self) -> dict[str, int]:
-        """Samples and frames sent so far, of each input."""
+        """Number of samples or frames that each input has sent."""
         found = {name: device.sent for name, device in self.imus.items()}
         return found | {"S5": self.can.sent, "mocap": self.server.sent}
 
@@ -144,10 +144,10 @@ class Inputs:
             tasks.create_task(self._send(sources))
 
     async def _send(self, sources: Sources) -> None:
-        """Send at the rates of the sources; the time of the devices passes during a pause, too.
+        """Send at the rates of the sources; the devices also sample while this process pauses.
 
-        Samples and frames are sent in the order of their times, as on a bus, also if this process
-        was paused and many are due.
+        Samples and frames are sent in the order of their times, as on a bus, even if many are due
+        after a pause of this process.
         """
         numbers = [0] * len(sources)
         while True:

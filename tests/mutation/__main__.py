@@ -1,4 +1,4 @@
-"""``make mutation``: how many of a random sample of mutants the tests of their package notice."""
+"""``make mutation``: measures the share of random mutants that the tests of a package detect."""
 
 from __future__ import annotations
 
@@ -42,15 +42,17 @@ PACKAGES = {
 FAST = "not system and not experiment and not alone and not real_time and not vm"
 OPTIONS = ["-x", "-q", "-m", FAST, "-p", "no:cacheprovider", "-o", "timeout=0"]
 OPTIONS += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
-"""Tests that start processes would import the unchanged source."""
+"""Options of pytest. Tests that start processes are excluded, because a process would import the
+unchanged source.
+"""
 CPU_FACTOR, CPU_S = 15, 5
-"""Processor time of the tests of a mutant: a multiple of what they use while lines are recorded,
-with a tenth of the inputs of property tests, and seconds.
+"""Limit of the processor time of the tests of a mutant: a multiple of the time without mutant, plus
+seconds. The time without mutant is measured with a tenth of the inputs of property tests.
 
-A mutant that needs more is killed: it loops.
+A mutant that needs more time is killed, because it contains an endless loop.
 """
 WALL_S = 7200.0
-"""Against tests that wait forever."""
+"""Time limit for tests that wait without end, s."""
 Chosen = tuple[Mutant, dict[str, Any]]
 """A mutant, and its description in the results."""
 PASSED = 0
@@ -207,7 +209,7 @@ def _executions(package: str) -> dict[str, Any]:
 def judge(package: str, mutant: Mutant) -> tuple[bool, str, str]:
     """Return whether a test fails that executes the changed statement, and the change.
 
-    A statement that is executed by an import may concern every test of the nearest folder, too.
+    If an import executes the statement, all tests of the nearest folder are run, too.
     """
     executions = _executions(package)
     tests, at_import = tests_of(mutant.path, mutant.line, executions)
@@ -236,7 +238,7 @@ def nearest_folder(path: Path, package: str) -> str:
 
 
 def in_fork(run: Callable[[], int], log: Path = Path(os.devnull)) -> int:
-    """Call a function in a fork; return what it returns, or another status if it ends."""
+    """Call a function in a fork; return its result, or the exit status if the fork dies."""
     sys.stdout.flush()
     child = os.fork()
     if child == 0:

@@ -1,4 +1,4 @@
-"""Which tests execute a line: only these can notice a change of it."""
+"""Record of the tests that execute a line. Only these tests can detect a change of the line."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class ExecutionRecorder:
 
 
 def tests_of(path: Path, line: int, executions: dict[str, Any]) -> tuple[list[str], bool]:
-    """Return the tests that execute a statement, fast ones first, and if its import does.
+    """Return the tests that execute a statement, fast tests first, and whether an import does.
 
     Tests of one file stay together, because they may have fixtures in common.
     """

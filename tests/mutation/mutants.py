@@ -94,7 +94,7 @@ def mutants_of(path: Path) -> list[Mutant]:
 
 
 def _unobservable(tree: ast.Module) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
-    """Yield begin and end of annotations and of what only type checkers read."""
+    """Yield begin and end of annotations and other code that only type checkers use."""
     for node in ast.walk(tree):
         unseen: Sequence[ast.AST | None] = ()
         if isinstance(node, ast.AnnAssign):

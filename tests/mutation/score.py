@@ -43,7 +43,8 @@ def text_of(results: dict[str, Any]) -> str:
     """Return the score of the stored sample for docs/reliability.md."""
     tested = [one for one in results["mutants"] if one["outcome"]]
     text = (
-        f"Stored are {len(tested)} of the {results['drawn']} mutants with seed {results['seed']}."
+        f"The stored results contain {len(tested)} of the {results['drawn']} mutants with seed"
+        f" {results['seed']}."
     )
     if len(tested) < results["drawn"]:
         text += (

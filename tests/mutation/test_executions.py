@@ -1,4 +1,4 @@
-"""The tests of a mutant are those that execute its statement, fast ones first."""
+"""A mutant is tested by the tests that execute its statement, fast tests first."""
 
 from __future__ import annotations
 

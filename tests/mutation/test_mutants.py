@@ -55,13 +55,15 @@ def test_the_score_as_drawn_counts_every_mutant_that_survived_the_first_run() ->
     row = table_of(mutants).splitlines()[-1]
     assert row == "| all | 6 | 2 | 33 | 10 to 70 | 1 | 1 | 1 | 1 | 75 |"
     text = text_of({"seed": 20, "drawn": 6, "mutants": mutants})
-    assert text.splitlines()[0] == "Stored are 6 of the 6 mutants with seed 20."
+    assert text.splitlines()[0] == "The stored results contain 6 of the 6 mutants with seed 20."
 
 
 def test_the_page_states_that_a_run_was_stopped() -> None:
     mutants = [{"package": "timing", "outcome": outcome} for outcome in ("killed", "")]
     text = text_of({"seed": 20, "drawn": 2, "mutants": mutants})
-    assert text.startswith("Stored are 1 of the 2 mutants with seed 20. The run was stopped")
+    assert text.startswith(
+        "The stored results contain 1 of the 2 mutants with seed 20. The run was stopped"
+    )
     assert text.splitlines()[-1].startswith("| all | 1 | 1 | 100 |")
 
 

@@ -1,4 +1,4 @@
-"""What is shipped: reproducible, complete, without keys; maintainer scripts and manual pages."""
+"""Packages: reproducible, complete, without secret keys; maintainer scripts and manual pages."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def tracked() -> list[Path]:
 
 
 def built(checkout: Path, folder: Path, zone: str = "UTC") -> dict[str, Path]:
-    """Return wheel and sdist, by suffix, as hatchling makes them of `checkout`."""
+    """Return the wheel and the sdist that hatchling builds from `checkout`, by suffix."""
     subprocess.run(
         [sys.executable, "-m", "hatchling", "build", "--directory", str(folder)],
         cwd=checkout, check=True, capture_output=True, env=os.environ | {"TZ": zone},
@@ -91,19 +91,19 @@ def test_maintainer_scripts_are_sound_shell_and_guard_systemd(name: str) -> None
     text = script.read_text()
     assert text.startswith("#!/bin/sh\n")
     assert "set -e" in text
-    assert "-d /run/systemd/system" in text  # also installs in a chroot
+    assert "-d /run/systemd/system" in text  # in a chroot, systemd does not run
     assert "systemctl" not in text.partition("-d /run/systemd/system")[0]
 
 
-def test_configuration_is_the_users_and_no_conffile() -> None:
-    # dpkg would ask about changes at every upgrade; a rig is always changed
+def test_the_configuration_is_no_conffile_of_dpkg() -> None:
+    # Users change every rig, and dpkg would ask about a changed conffile at every upgrade.
     assert not (DEBIAN / "conffiles").exists()
     assert "! -e /etc/jointfitd/rig.toml" in (DEBIAN / "postinst").read_text()
     assert '"$1" = purge' in (DEBIAN / "postrm").read_text()
 
 
 def test_everything_that_the_virtual_machine_imports_exists() -> None:
-    # there, programs are texts, which no type checker reads
+    # The programs for the virtual machine are strings, which no type checker reads.
     found = [
         (module, name)
         for path in sorted((ROOT / "tests" / "vm_service").glob("*.py"))

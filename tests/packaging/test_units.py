@@ -1,4 +1,4 @@
-"""The files for systemd and udev: what they promise, and that the promises are documented."""
+"""The files for systemd and udev: their settings, and the documentation of the settings."""
 
 from __future__ import annotations
 
@@ -43,17 +43,18 @@ def test_both_units_differ_only_where_the_instance_is_named() -> None:
     assert all("%i" in b[1] for a, b in zip(one, many, strict=True) if a != b)
 
 
-def test_a_wrong_rig_is_not_tried_again_and_all_else_is() -> None:
+def test_only_a_usage_error_or_a_used_directory_prevents_a_restart() -> None:
     assert setting("Restart") == "always"
     assert setting("RestartPreventExitStatus") == f"{EXIT_USAGE} {EXIT_IN_USE}"
     assert setting("StartLimitIntervalSec") == "0"
-    assert "ExecStartPre" not in dict(directives(ONE))  # its exit status would restart for ever
+    assert "ExecStartPre" not in dict(directives(ONE))  # a failed ExecStartPre restarts without end
 
 
 def test_the_shipped_times_are_the_documented_ones() -> None:
     assert setting("Type") == "notify"
     assert setting("RestartSec") == "2"
-    assert "| restart | 2 s after any exit except with codes 2 and 3, without limit |" in GUIDE
+    assert "| restart | 2 s after any exit except with codes 2 and 3; the number" in GUIDE
+    assert "number of restarts is not limited |" in GUIDE
     assert setting("WatchdogSec") == "10"
     assert "| watchdog | 10 s (`WatchdogSec=`)" in GUIDE
     assert setting("TimeoutStopSec") == "15"
@@ -114,7 +115,7 @@ def test_can_unit_neither_delays_the_boot_nor_uses_optional_adapter_features() -
     assert not any(line.startswith("RestartSec") for line in active)
 
 
-def test_the_broker_example_has_tls_rights_and_no_guests() -> None:
+def test_the_broker_example_has_tls_access_rights_and_no_anonymous_clients() -> None:
     lines = (SYSTEMD / "mosquitto" / "jointfitd.conf").read_text().splitlines()
     for wanted in ("allow_anonymous false", "tls_version tlsv1.2", "listener 1883 127.0.0.1"):
         assert wanted in lines

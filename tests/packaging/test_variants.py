@@ -1,4 +1,4 @@
-"""Compiled and interpreted modules: which of them runs, and that both return the same values."""
+"""Compiled and interpreted modules: selection of a variant, and equal results of both variants."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_tests_run_on_sources_unless_the_compiled_modules_are_requested() -> Non
 
 @pytest.fixture
 def package(tmp_path: Path) -> Path:
-    """A package with the module `wire` in both forms, the compiled one not loadable."""
+    """Return a package with the module `wire` in both forms; the compiled form cannot be loaded."""
     inner = tmp_path / "mixed" / "inner"
     inner.mkdir(parents=True)
     (inner.parent / "__init__.py").write_text(PACKAGE)
@@ -54,7 +54,7 @@ def test_jointfit_pure_imports_sources_instead_of_extension_modules(
     )  # fmt: skip
     if imported == "source":
         assert done.stdout == "source\n", done.stderr
-    else:  # Python found the extension module, which is none
+    else:  # Python found the file of the extension module, which cannot be loaded
         assert "ImportError" in done.stderr
 
 
@@ -72,7 +72,7 @@ def test_compiled_modules_and_their_sources_give_the_same_frames_bit_for_bit() -
 
 
 class _Letter(NamedTuple):
-    """Message of a made-up protocol: one byte after a start byte."""
+    """Message of an invented protocol: one byte after a start byte."""
 
     letter: bytes
     end: int

@@ -1,6 +1,6 @@
 """Print the variant of this process, then all outputs of a core for four sensors and cameras.
 
-A program of its own: the variant of a process does not change after its first import.
+This is a separate program, because the variant of a process does not change after its first import.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from jointfit_daemon.pipeline import Core
 from jointfit_variant import running_variant
 
 SECONDS = 14.0
-"""Long enough for one estimate of the lag of every sensor, s."""
+"""Duration that suffices for one estimate of the lag of every sensor, s."""
 SILENT = ("S2", 3.0, 4.0)
-"""Sensor without data, from and to, s."""
+"""Sensor without data, and begin and end of the gap, s."""
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Pictures of a terminal: a command and what it printed, as SVG by Rich."""
+"""Pictures of a terminal with a command and its output, as SVG by Rich."""
 
 from __future__ import annotations
 

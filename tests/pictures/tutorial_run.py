@@ -93,7 +93,7 @@ class TutorialRun:
                 await self._terminal(shell, begin)
             await self._terminal(shell, "jointfitd --config")
             await self._dashboard("uncalibrated", "#empty", "Not calibrated yet", CLOCKS_S)
-            # no browser meanwhile: it takes processor time from the simulated devices
+            # the browser is closed, because it takes processor time from the simulated devices
             await self._terminal(shell, "jointfit calibrate")
             await self._walk()
             await self._dashboard("live", "#angle-value", "°", WALK_S)

@@ -1,4 +1,4 @@
-"""The canonical orientation, against SciPy and the bench test anyone can repeat."""
+"""The canonical orientation, compared with SciPy, and the acceptance of quaternions."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_accepted_quaternions_are_unit_with_continuous_sign(path: Any) -> None:
 @pytest.mark.parametrize(
     ("norm", "passes"), [(1.0, True), (1.0099, True), (1.011, False), (0.98, False), (0.0, False)]
 )
-def test_the_norm_decides(norm: float, passes: bool) -> None:
+def test_the_norm_decides_whether_a_quaternion_is_accepted(norm: float, passes: bool) -> None:
     assert (OrientationGate().admit((norm, 0.0, 0.0, 0.0)) is not None) == passes
 
 

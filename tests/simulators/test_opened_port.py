@@ -1,4 +1,4 @@
-"""A simulated sensor on a serial port is read from the first opening of its port on."""
+"""A simulated device reads its serial port from the first time that the host opens the port."""
 
 from __future__ import annotations
 

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(300)]
 
-# Two on UARTs and two on CAN. What a streaming device sends before the first reply of its
-# handshake is discarded: these are silent until then, or have no handshake.
+# Two on UARTs and two on CAN. Data that a device sends before the first reply of its handshake are
+# discarded. These devices are silent before the handshake, or have no handshake.
 FAMILIES = {"S1": "bno085", "S2": "lpms-can", "S3": "serial-table", "S4": "can-table"}
 
 
@@ -34,7 +34,7 @@ async def test_four_families_meet_the_targets_of_the_demo_with_each_camera_syste
     options += ["--mocap", cameras]
     figures, stopped = await _run(tmp_path, 8.0, "leg", options, headless=True, picture=None)
     assert stopped is None
-    # Other experiments run beside this one; tests/system/test_timing_end_to_end.py judges latency.
+    # Other experiments run beside this one; tests/system/test_timing_end_to_end.py tests latency.
     assert [text for text in missed_targets(figures) if not text.startswith("latency")] == []
     assert figures["corrupt"] == 0
     rig = (tmp_path / "rig.toml").read_text(encoding="utf-8")

@@ -61,8 +61,7 @@ TURNED_BY = """([name, degrees]) => {
   const angle = text === 'not turned' ? 0 : Number(/turned (\\d+)°/.exec(text)?.[1] ?? NaN);
   return Math.abs(angle - degrees) <= 5;
 }"""
-"""JavaScript that returns whether the check of axes shows this rotation, within the limit of "not
-turned"."""
+"""JavaScript that returns whether the check of axes shows this rotation, within 5 degrees."""
 KNEES = "jointfit.store.poses.map((pose) => pose.joints.knee.flexion_deg).filter((x) => x !== null)"
 READY = {
     "live": "difference from the cameras", "calibrate": "Held-out error",

@@ -1,4 +1,4 @@
-"""The physical test in the dashboard: a hand follows the page, and the daemon judges the sensor."""
+"""The physical test in the dashboard: a simulated hand follows its steps."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(400)]
 
 OPTIONS = ("--follow", "--no-mocap", "--rate", "50", "--output-rate-hz", "50")
-"""Options of the simulator: IMUs only, so that no fit takes minutes."""
+"""Options of the simulator: IMUs only, because a fit with cameras takes long."""
 SHORT = (("static_s = 5", "static_s = 3"),)
 ENVIRONMENT = {**os.environ, "TERM": "xterm-256color", "LANG": "C.UTF-8", "LC_ALL": "C.UTF-8"}
 

@@ -16,12 +16,12 @@ pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(60
 FAMILIES = {"S1": "serial-table", "S2": "can-table", "S3": "serial-table", "S4": "can-table"}
 
 
-async def test_four_boards_of_ones_own_meet_the_targets_of_the_demo(tmp_path: Path) -> None:
+async def test_four_boards_described_by_tables_meet_the_targets_of_the_demo(tmp_path: Path) -> None:
     pytest.importorskip("iotcore")
     options = [word for name, driver in FAMILIES.items() for word in ("--imu", f"{name}={driver}")]
     figures, stopped = await _run(tmp_path, 8.0, "leg", options, headless=True, picture=None)
     assert stopped is None
-    # Other experiments run beside this one; tests/system/test_timing_end_to_end.py judges latency.
+    # Other experiments run beside this one; another test tests the latency.
     assert [text for text in missed_targets(figures) if not text.startswith("latency")] == []
     assert figures["corrupt"] == 0
     rig = (tmp_path / "rig.toml").read_text(encoding="utf-8")

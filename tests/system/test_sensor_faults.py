@@ -1,4 +1,4 @@
-"""Failing sensors of a worn rig: reported in time, excluded from the poses, reported as working."""
+"""Sensor faults during a movement: reported in time, excluded from poses, reported as ended."""
 
 from __future__ import annotations
 

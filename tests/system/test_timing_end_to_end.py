@@ -17,12 +17,14 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.system, pytest.mark.alone, pytest.mark.experiment]
 
 MOST_ERROR_NS = 500_000
-"""Limit of the part that machine load does not explain; live-rig-restarts is stricter, ns."""
+"""Limit of the part of an error that machine load does not explain, ns. The experiment
+live-rig-restarts has a stricter limit."""
 MOST_TIED_ERROR_NS = 250_000
-"""Largest difference from the stamps of the cameras: ticks of 100 us and jitter of 20 us on each
-stamp, ns."""
+"""Largest difference from the stamps of the cameras, ns. A stamp has ticks of 100 us and a jitter
+of 20 us."""
 MOST_PTP_ERROR_NS = 50_000
-"""Both processes read the same clock once; a microsecond on an idle machine, ns."""
+"""Largest error of a PTP stamp, ns. Both processes read the same clock; on an idle machine, the
+error is a microsecond."""
 
 
 @pytest.mark.timeout(180)
@@ -47,8 +49,8 @@ async def test_wired_sync_line_removes_the_transport_delay(tmp_path: Path, broke
     """Stamps of a clock with sync edges agree with the stamps of the cameras although the transport
     delay of the sensor is unknown.
 
-    On a loaded machine the clock of the cameras is wrong, and every clock with edges with it;
-    `test_every_synced_frame_has_correct_time` judges that error.
+    On a loaded machine, the clock of the cameras has an error, and all clocks with sync edges have
+    the same error. `test_every_synced_frame_has_correct_time` tests this error.
     """
     found = await live(tmp_path, broker.port, (), rest_s=9.0, more=("--sync-line",))
     assert found.replayed

@@ -1,4 +1,4 @@
-"""Every test on the interface finds it up, and leaves it up."""
+"""Fixtures for tests on vcan0, which is up before and after every test."""
 
 from __future__ import annotations
 

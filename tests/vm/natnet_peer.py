@@ -1,4 +1,4 @@
-"""A NatNet server on another host: run in its own network namespace, at the given address."""
+"""A NatNet server on another host, simulated by a network namespace, at the given address."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ POSE = ((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0))
 
 async def serve(address: str) -> None:
     """Send a multicast frame every 10 ms, and answer requests and broadcasts."""
-    _natnet_port.LOOPBACK = "0.0.0.0"  # the simulator is bound to loopback otherwise
+    _natnet_port.LOOPBACK = "0.0.0.0"  # by default, the simulator is bound to the loopback
     bodies = (RigidBodyAsset("Thigh", ("T1",), 1),)
     options = NatNetServerOptions(bodies, transport="multicast", command_port=1510, data_port=1511)
     server = NatNetServer(options)

@@ -21,7 +21,7 @@ pytestmark = NEEDS_VCAN
 
 
 def error_frame(wire: PythonCanWire, kind: int, data: bytes = bytes(8)) -> None:
-    """Have the kernel hand on an error frame, as a controller's driver makes one."""
+    """Send an error frame through the kernel, like the driver of a CAN controller."""
     assert wire._bus is not None
     wire._bus.send(
         can.Message(
@@ -66,7 +66,7 @@ async def test_after_bus_off_the_silence_is_a_loss_and_a_restart_brings_the_sens
     await asyncio.sleep(0.05)
     identity(XcdiDevice(wire), 5)
     await heard.wait_for(5)
-    for _ in range(20):  # a controller that is off sends no samples, and its errors are no life
+    for _ in range(20):  # only error frames, which do not end the silence of the sensor
         error_frame(wire, 0x040)
         await asyncio.sleep(0.05)
     with pytest.raises(DeviceLostError, match=r"silent: check its power"):

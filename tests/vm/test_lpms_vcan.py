@@ -1,6 +1,6 @@
-"""The driver of LPMS sensors on real SocketCAN: both modes, both precisions, other sensors beside.
+"""The driver of LPMS sensors on real SocketCAN: both modes, both precisions, and other sensors.
 
-Runs where the kernel has an interface vcan0 that may be changed, see test_socketcan.
+The tests need an interface vcan0 that may be changed, see test_socketcan.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def lpms_settings(
 ) -> LpmsCanSettings:
     ids = {f"frame{k}": number for k, number in enumerate(numbers, 1)}
     table: dict[str, Any] = {"id": name, "segment": "shank", "driver": "lpms-can", "can": BUS}
-    # the machine may stop between two frames of a sample for longer than half of 10 ms
+    # A low rate: the machine may pause between two frames of a sample for more than 5 ms.
     table |= {"rate_hz": 10, "silence_s": 0.5}
     return LpmsCanSettings.model_validate(
         {**table, "mode": mode, "ids": ids, "precision": precision}
@@ -61,7 +61,7 @@ class TestLpmsOnVcanThatGoesDown(DriverContract):
         numbers = sequential_ids(1, spaced=False)
         return LpmsCanImu(lpms_settings(numbers, "sequential", "float32"))
 
-    # CAN has its own error detection, and anything at all may be on a bus.
+    # CAN has its own error detection, and devices of any kind may be on a bus.
     test_line_noise_affects_only_damaged_samples = None  # type: ignore[assignment]
     test_wrong_device_raises_device_misconfigured = None  # type: ignore[assignment]
 
@@ -112,7 +112,7 @@ async def test_stamps_are_the_kernels_because_the_sensor_sends_no_time(
 async def test_neighbours_with_overlapping_identifiers_are_refused(wire: PythonCanWire) -> None:
     first, second = (sequential_ids(node, spaced=False) for node in (1, 2))
     async with running(LpmsCanImu(lpms_settings(first, "sequential"))):
-        with pytest.raises(DeviceMisconfiguredError, match="also that of S3"):
+        with pytest.raises(DeviceMisconfiguredError, match="also used by S3"):
             await LpmsCanImu(lpms_settings(second, "sequential", name="S4")).run(lambda _: None)
 
 

@@ -1,6 +1,6 @@
-"""The XCDI driver on real SocketCAN: filters, stamps, overflow, links that go and come.
+"""The XCDI driver on real SocketCAN: filters, stamps, overflow, and interfaces that disappear.
 
-Runs where the kernel has an interface vcan0 that may be changed: in the light virtual machine
+The tests need an interface vcan0 that may be changed. They run in the light virtual machine
 (``.ci/light_vm.py``), or as root on any Linux with vcan.
 """
 
@@ -55,7 +55,7 @@ class TestXcdiOnVcanThatGoesDown(DriverContract):
     def make_driver(self, folder: Path) -> Driver:
         return XcdiImu(settings())
 
-    # CAN has its own error detection, and anything at all may be on a bus.
+    # CAN has its own error detection, and devices of any kind may be on a bus.
     test_line_noise_affects_only_damaged_samples = None  # type: ignore[assignment]
     test_wrong_device_raises_device_misconfigured = None  # type: ignore[assignment]
 
@@ -158,7 +158,7 @@ async def test_frames_that_the_kernel_dropped_are_counted_exactly(wire: PythonCa
         seen = 0
         while not seen or seen != arrived():  # until the queue is empty
             seen = arrived()
-            await asyncio.sleep(0.3)  # the kernel's counter is looked at every 0.25 s
+            await asyncio.sleep(0.3)  # the driver reads the kernel's counter every 0.25 s
         identity(device, 1, first=burst)
         dropped = 0
         async with asyncio.timeout(10):
@@ -235,5 +235,5 @@ async def test_a_silent_sensor_is_lost_alone_on_a_live_bus(wire: PythonCanWire) 
 
 async def test_two_sensors_with_one_identifier_are_refused_by_name(wire: PythonCanWire) -> None:
     async with running(XcdiImu(settings("S3"))):
-        with pytest.raises(DeviceMisconfiguredError, match=r"0x.*also that of S3"):
+        with pytest.raises(DeviceMisconfiguredError, match=r"0x.*also used by S3"):
             await XcdiImu(settings("S4")).run(lambda _: None)

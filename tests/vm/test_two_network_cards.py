@@ -79,7 +79,7 @@ async def test_the_card_of_the_route_receives_and_the_other_is_named_as_wrong() 
         pass
     risk, stream = await diagnosed()
     assert (risk.level, stream.level) == ("note", "ok")
-    assert "two interfaces reach" in risk.text
+    assert "several interfaces reach" in risk.text
     assert [each.level for each in await diagnosed(interface="v0")] == ["ok"]
 
     wrong, other = await diagnosed(interface="w0")

@@ -1,4 +1,4 @@
-"""What the tests on real SocketCAN share: the interface, a driver that runs, what it was heard."""
+"""Helpers for tests on real SocketCAN: the interface, a running driver, and received frames."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def ip(*words: str) -> None:
 
 
 class LinkWire(PythonCanWire):
-    """A wire whose plug is the interface itself."""
+    """A wire that is unplugged by setting the interface down."""
 
     def __init__(self) -> None:
         ip("set", LINK, "up")
@@ -69,7 +69,7 @@ class LinkWire(PythonCanWire):
 
 
 class RemovableWire(PythonCanWire):
-    """A wire whose plug is the adapter: the interface vanishes and comes back."""
+    """A wire that is unplugged by deleting the interface, as with a removed adapter."""
 
     def __init__(self) -> None:
         super().__init__("socketcan", LINK)

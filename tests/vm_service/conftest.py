@@ -1,4 +1,6 @@
-"""The machine as every test finds it: simulator and broker up, the simulator's rig, no service."""
+"""State of the machine before each test: simulator and broker run, the rig is installed, and the
+service does not run.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
-class TellsAtOnce:
-    """Prints why a test failed when it fails: a run that is cut short has no summary."""
+class FailurePrinter:
+    """Prints the reason of a failure at once, because an interrupted run has no summary."""
 
     def __init__(self, config: pytest.Config) -> None:
         self._plugins = config.pluginmanager
@@ -25,7 +27,7 @@ class TellsAtOnce:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    config.pluginmanager.register(TellsAtOnce(config), "tells at once")
+    config.pluginmanager.register(FailurePrinter(config), "failure printer")
 
 
 @pytest.fixture
@@ -47,6 +49,6 @@ def since() -> str:
 
 @pytest.fixture
 def service(since: str) -> int:
-    """The running service's process id."""
+    """Start the service, and return its process id."""
     run("systemctl", "start", UNIT)
     return int(show("MainPID"))

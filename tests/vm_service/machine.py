@@ -1,4 +1,4 @@
-"""What the tests of the installed service use: systemctl, the journal, mosquitto's own clients."""
+"""Helpers for tests of the installed service: systemctl, the journal, mosquitto's clients."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ SIM = Path("/run/jointfit-sim")
 BASE = "jointfit/vm"
 CA = "/etc/mosquitto/certs/ca.crt"
 QUIET_S = 0.5
-"""What the work of ``slowness`` takes on a quiet machine at most."""
+"""Longest duration of the work of ``slowness`` on an idle machine, s."""
 TLS = f'[mqtt.tls]\nca = "{CA}"\n'
 
 
 def run(*words: str, check: bool = True) -> str:
-    """Return what a command prints."""
+    """Return the output of a command."""
     done = subprocess.run(words, text=True, capture_output=True, check=False)
     assert not check or done.returncode == 0, f"{' '.join(words)}: {done.stdout}{done.stderr}"
     return done.stdout.strip()
@@ -36,22 +36,22 @@ def show(name: str, unit: str = UNIT) -> str:
 
 
 def eventually(claim: Callable[[], object], what: str, seconds: float = 60.0) -> Any:
-    """Return the first true answer of `claim`; fail with `what` when time is up.
+    """Return the first true result of `claim`; fail with `what` after `seconds`.
 
-    The time is for a machine that is badly overloaded: it is spent only by tests that fail.
+    The default time is long enough for an overloaded machine. Only failing tests need it.
     """
     end = time.monotonic() + seconds
     while not (answer := claim()):
         assert time.monotonic() < end, f"not within {seconds:g} s: {what}; {show('StatusText')}"
-        time.sleep(0.5)  # a look costs as much as a second of the daemon
+        time.sleep(0.5)  # a check costs as much CPU time as the daemon in a second
     return answer
 
 
 def slowness() -> float:
-    """Return how much slower than a quiet machine this one is just now, 1 at least.
+    """Return the factor by which this machine is slower than an idle machine, at least 1.
 
-    The guest cannot see what its host does beside it, so fixed work is timed; claims on time are
-    for a quiet machine and stretch by this.
+    The guest cannot measure the load of its host, so the time of fixed work is measured. Time
+    limits apply to an idle machine and are multiplied by this factor.
     """
     began = time.monotonic()
     run("python3", "-I", "-c", "sum(k * k for k in range(1_000_000))")
@@ -59,18 +59,18 @@ def slowness() -> float:
 
 
 def journal(since: str, unit: str = UNIT) -> str:
-    """Return what the unit logged since a cursor (see ``cursor``)."""
+    """Return the log lines of the unit since a cursor (see ``cursor``)."""
     return run("journalctl", "-b", "-o", "cat", "-u", unit, f"--after-cursor={since}")
 
 
 def cursor() -> str:
-    """Return the journal's end."""
+    """Return the cursor of the end of the journal."""
     last = run("journalctl", "-b", "-n", "0", "--show-cursor")
     return last.rpartition("-- cursor: ")[2].strip()
 
 
 def messages(topic: str, count: int = 1, seconds: float = 10.0) -> list[Any]:
-    """Return that many messages below the base, as the viewer gets them over TLS."""
+    """Return `count` messages below the base topic, which the viewer receives over TLS."""
     text = run(
         "mosquitto_sub", "-h", "localhost", "-p", "8883", "--cafile", CA, "-V", "mqttv5",
         "-u", "viewer", "-P", "look", "-t", f"{BASE}/{topic}", "-C", str(count),
@@ -81,9 +81,9 @@ def messages(topic: str, count: int = 1, seconds: float = 10.0) -> list[Any]:
 
 @contextlib.contextmanager
 def listening(topic: str, seconds: int = 240) -> Iterator[Iterator[Any]]:
-    """Give the messages below the base as they come, the retained one first.
+    """Yield an iterator over the messages below the base topic, retained messages first.
 
-    One process for all of them: asking again and again takes the time that the daemon needs.
+    A single process receives all messages, because repeated starts of a client load the machine.
     """
     words = (
         "mosquitto_sub", "-h", "localhost", "-p", "8883", "--cafile", CA, "-V", "mqttv5",
@@ -120,7 +120,7 @@ def answer(command: str, text: str = "", /, **arguments: object) -> dict[str, An
 
 
 def write_rig(change: Callable[[str], str] = lambda text: text) -> None:
-    """Install the simulator's rig, with TLS and a user, and what `change` makes of it."""
+    """Install the simulator's rig with TLS and a user, modified by `change`."""
     text = (SIM / "rig.toml").read_text()
     text = text.replace(
         'host = "localhost"\nport = 1883', 'host = "localhost"\nusername = "jointfitd"'
@@ -131,7 +131,7 @@ def write_rig(change: Callable[[str], str] = lambda text: text) -> None:
 
 
 def give_ports() -> None:
-    """Let the unit's group open the virtual serial ports, as udev does for real ones."""
+    """Permit the unit's group to open the virtual serial ports, as udev does for real ports."""
     for link in SIM.glob("tty*"):
         with contextlib.suppress(FileNotFoundError):
             os.chown(link, 0, 20)  # dialout
@@ -139,6 +139,6 @@ def give_ports() -> None:
 
 
 def sim(command: str) -> None:
-    """Tell the simulator something."""
+    """Send a command to the simulator."""
     with open("/run/sim.commands", "w") as fifo:  # noqa: PTH123 - a fifo
         fifo.write(f"{command}\n")

@@ -1,6 +1,6 @@
-"""Run in the daemon's place, under its own unit: tries what it must not be able to do.
+"""Runs instead of the daemon under its unit, and tries operations that the unit must forbid.
 
-Prints one JSON object: for every attempt the errno it met, or 0 where it went through.
+It prints one JSON object with the errno of every operation, or 0 if the operation succeeded.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ LIBC = ctypes.CDLL(None, use_errno=True)
 
 
 def tried(attempt: object) -> int:
-    """Return the errno of an attempt, 0 if it went through."""
+    """Return the errno of an operation, 0 if it succeeded."""
     try:
         attempt()  # type: ignore[operator]
     except OSError as error:
@@ -28,7 +28,7 @@ def tried(attempt: object) -> int:
 
 
 def call(number: int, *arguments: int) -> int:
-    """Return the errno of a system call."""
+    """Return the errno of a system call, 0 if it succeeded."""
     ctypes.set_errno(0)
     return ctypes.get_errno() if LIBC.syscall(number, *arguments) == -1 else 0
 
@@ -38,7 +38,7 @@ def write(path: str) -> int:
 
 
 def packet(address: str) -> int:
-    """Return the errno of a datagram to `address`; the machine has a route to it."""
+    """Return the errno of sending a datagram to `address`, to which the machine has a route."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as speaker:
         return tried(lambda: speaker.sendto(b"x", (address, 1511)))
 
@@ -79,7 +79,7 @@ found = {
     "new capability": 0 if int(capabilities(), 16) else 1,
     "setuid": tried(lambda: os.setuid(0)),
     "public network": packet("198.51.100.7"),
-    # what it must be able to do
+    # operations that the unit must permit
     "may write its state": write(os.environ["STATE_DIRECTORY"] + "/probe"),
     "may open its port": tried(lambda: os.open(PORT, os.O_RDWR | os.O_NOCTTY)),
     "may speak CAN": tried(lambda: socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)),

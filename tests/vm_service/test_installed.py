@@ -1,4 +1,4 @@
-"""What the package brings beside the program: udev rules, signed requests, files as they were."""
+"""Parts of the installed package: udev rules, signed requests, and unchanged files."""
 
 from __future__ import annotations
 
@@ -31,22 +31,20 @@ SIGN = (
 )
 
 
-def test_udev_reads_our_rules_and_complains_only_about_broken_ones_beside_them() -> None:
+def test_udev_reads_the_rules_and_reports_only_the_broken_rules_of_another_file() -> None:
     assert Path("/usr/lib/udev/rules.d/70-jointfitd.rules").is_file()
     broken = Path("/run/udev/rules.d/71-broken.rules")
     broken.parent.mkdir(parents=True, exist_ok=True)
     broken.write_text('SUBSYTEM=="tty", GROUP="dialout"\n')
     try:
 
-        def complaints() -> str:  # rules are read with the first event after they changed
+        def complaints() -> str:  # udev reads changed rules at the next event
             run("udevadm", "control", "--reload")
             run("udevadm", "trigger", "--subsystem-match=tty", "--subsystem-match=net")
             said = run("journalctl", "-b", "-o", "cat", "-t", "systemd-udevd")
             return said if "71-broken.rules" in said else ""
 
-        assert "70-jointfitd.rules" not in eventually(
-            complaints, "the broken file is complained of"
-        )
+        assert "70-jointfitd.rules" not in eventually(complaints, "udev reports the broken file")
     finally:
         broken.unlink()
         run("udevadm", "control", "--reload")
@@ -71,7 +69,7 @@ def test_the_unit_is_read_without_complaint() -> None:
 
 @pytest.fixture
 def key() -> Iterator[bytes]:
-    """Give the service a key that requests must be signed with."""
+    """Install a key with which requests to the service must be signed; yield the key."""
     made = secrets.token_hex(32)
     KEY.write_text(f"{made}\n")
     KEY.chmod(0o600)
@@ -80,7 +78,7 @@ def key() -> Iterator[bytes]:
 
 
 def signed(request: dict[str, object]) -> str:
-    """Return `request` signed by the program that was installed."""
+    """Return `request`, signed by the installed program."""
     topic = f"{BASE}/bridge/request/calibrate"
     words = ["/usr/lib/jointfitd/bin/python3", "-I", "-c", SIGN, str(KEY), topic]
     return run(*words, json.dumps(request))

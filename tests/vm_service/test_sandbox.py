@@ -1,4 +1,4 @@
-"""What the unit keeps its program from, tried by a probe that runs under the very same unit."""
+"""Operations that the unit forbids or permits, tried by a probe that runs under the same unit."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ CAN_DROP_IN = Path("/usr/share/jointfitd/systemd/jointfitd-can.conf")
 
 @pytest.fixture(scope="module")
 def found() -> dict[str, int]:
-    """What the probe met with the drop-in for CAN: errno of each attempt."""
+    """Return the errno of each operation of the probe, with the drop-in for CAN."""
     return probe(UNIT_FILE.read_text() + CAN_DROP_IN.read_text())
 
 
 def probe(text: str) -> dict[str, int]:
-    """Run the probe under a unit with this text."""
+    """Run the probe under a unit with this text; return the errno of each operation."""
     program = Path("/usr/local/lib/jointfit-probe.py")
     shutil.copyfile(Path(__file__).with_name("probe.py"), program)
     program.chmod(0o644)
@@ -78,7 +78,7 @@ def test_every_attempt_is_judged(found: dict[str, int]) -> None:
 
 
 def test_root_outside_the_unit_is_not_refused() -> None:
-    # the control: an errno above means the unit, not the machine
+    # Without the unit the operations succeed, so the errnos above are an effect of the unit.
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as speaker:
         assert speaker.sendto(b"x", ("198.51.100.7", 1511)) == 1
     assert Path("/root").is_dir()

@@ -60,7 +60,7 @@ def test_installation_creates_an_example_rig_and_starts_no_service() -> None:
 def outcome(phase: str, wanted: str, **arguments: object) -> dict[str, Any]:
     """Run a phase of the calibration to its end; return its final status."""
     with listening("calibration") as heard:
-        said: dict[str, Any] = next(heard)  # what was before
+        said: dict[str, Any] = next(heard)  # the retained status
         assert answer("calibrate", phase=phase, **arguments)["status"] == "accepted"
         for said in heard:
             if said["phase"] in {wanted, "aborted"}:
@@ -102,7 +102,7 @@ def test_status_line_counts_the_connected_devices(service: int) -> None:
 def test_a_start_is_ready_at_once_and_a_stop_takes_less_than_three_seconds(since: str) -> None:
     began = time.monotonic()
     run("systemctl", "start", UNIT)
-    assert time.monotonic() - began < 8.0 * slowness()  # Python alone takes two in here
+    assert time.monotonic() - began < 8.0 * slowness()  # Python alone needs 2 s in the guest
     eventually(online, "online")
     began = time.monotonic()
     run("systemctl", "stop", UNIT)
@@ -149,7 +149,7 @@ def test_missing_credential_is_reported_and_sensors_remain_in_use(since: str) ->
         hidden.rename(credential)
 
 
-def test_without_a_broker_it_starts_and_publishes_when_one_comes(since: str) -> None:
+def test_the_service_starts_without_a_broker_and_publishes_once_a_broker_runs(since: str) -> None:
     run("systemctl", "stop", "mosquitto")
     run("systemctl", "start", UNIT)
     eventually(lambda: "broker" in show("StatusText"), "the status says so")
@@ -157,7 +157,7 @@ def test_without_a_broker_it_starts_and_publishes_when_one_comes(since: str) -> 
     eventually(online, "online")
 
 
-def test_a_bus_that_comes_later_is_taken(since: str) -> None:
+def test_a_bus_that_appears_later_is_used(since: str) -> None:
     run("ip", "link", "del", "can0")
     try:
         run("systemctl", "start", UNIT)
@@ -170,17 +170,17 @@ def test_a_bus_that_comes_later_is_taken(since: str) -> None:
         eventually((SIM / "rig.toml").is_file, "the simulator is back")
 
     def bus_there() -> bool:
-        give_ports()  # udev's work, for ports that are links
+        give_ports()  # udev does this for real ports
         return "of 4 IMUs" in show("StatusText") and not on_the_bus & missing()
 
     assert len(on_the_bus) == 2
     eventually(bus_there, "both on the bus")
 
 
-def test_enabled_it_starts_with_the_machine() -> None:
+def test_an_enabled_service_starts_at_boot() -> None:
     run("systemctl", "enable", UNIT)
     try:
-        run("systemctl", "start", "--no-block", "multi-user.target")  # what a boot ends with
+        run("systemctl", "start", "--no-block", "multi-user.target")  # last target of a boot
         eventually(lambda: show("ActiveState") == "active", "started by the target")
     finally:
         run("systemctl", "disable", "--now", UNIT)
@@ -241,10 +241,11 @@ def test_no_secret_is_visible_to_other_users(service: int, since: str) -> None:
     assert "s3cret" not in shown
 
 
-def test_a_viewer_cannot_ask(service: int) -> None:
+def test_a_viewer_cannot_send_requests(service: int) -> None:
     eventually(online, "online")
     ask("calibrate", user="viewer", password="look", phase="static", transaction="x")
-    assert answer("calibrate", phase="nothing")["status"] == "error"  # what came before is through
+    # the answer shows that the earlier request was processed
+    assert answer("calibrate", phase="nothing")["status"] == "error"
     assert messages("calibration", seconds=2)[0]["phase"] != "static"
 
 

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from jointfit_simulators.devices._tcp_port import TcpClient
 
 _NEWEST = (1, 28)
+"""Newest version of the protocol of QTM. The driver `qtm` requests an older version."""
 _OLDEST = (1, 19)
 _FIRST: tuple[int, int] = (1, 1)
 """Protocol version for a client that selects no version."""

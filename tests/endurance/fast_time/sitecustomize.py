@@ -1,4 +1,4 @@
-"""Time of a daemon process runs faster than real time: Python imports this module at its start.
+"""Accelerates the time of a daemon process; Python imports this module at its start.
 
 ENDURANCE is the path of a file, the factor, and the instant at which both times agree, ns of
 CLOCK_MONOTONIC. The file receives the numbers of asyncio tasks, of Python objects and of bytes that
@@ -18,7 +18,7 @@ from pathlib import Path
 
 _COUNTS = struct.Struct("<qqq")
 _COUNT_S = 2.0
-"""Real time between two counts, s: one takes milliseconds."""
+"""Real time between two counts, s. A count takes milliseconds."""
 
 
 class _Mallinfo(ctypes.Structure):
@@ -38,7 +38,7 @@ _mallinfo2.restype = _Mallinfo
 
 
 def _allocated_bytes() -> int:
-    """Return the size of all allocated blocks: unlike the resident memory, without free blocks."""
+    """Return the size of all allocated blocks, without the free blocks of the resident memory."""
     found = _mallinfo2()
     return int(found.uordblks + found.hblkhd)
 
@@ -49,7 +49,7 @@ def _install(path: str, factor: int, begin_ns: int) -> None:
         time.sleep,
         selectors.EpollSelector.select,
     )
-    unix_ns = time.time_ns() - real_ns()  # one offset: a correction must not be multiplied
+    unix_ns = time.time_ns() - real_ns()  # constant: a clock correction must not be multiplied
 
     def monotonic_ns() -> int:
         return begin_ns + (real_ns() - begin_ns) * factor
@@ -60,7 +60,7 @@ def _install(path: str, factor: int, begin_ns: int) -> None:
     time.time = lambda: time.time_ns() * 1e-9
     time.sleep = lambda seconds: real_sleep(float(seconds) / factor)
 
-    # A thread that waits for the interpreter waits as long as in real time, in the process's time.
+    # The switch interval of threads remains the same in accelerated time.
     sys.setswitchinterval(sys.getswitchinterval() / factor)
 
     with Path(path).open("r+b") as file:

@@ -1,4 +1,4 @@
-"""The broker stops to read but keeps its connections."""
+"""The broker stops reading but keeps its connections."""
 
 from __future__ import annotations
 

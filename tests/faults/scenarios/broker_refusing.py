@@ -1,4 +1,4 @@
-"""Something accepts connections on the broker's port and closes them."""
+"""Another program accepts connections on the broker's port and closes them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The way to the broker passes a tenth of the bytes that the daemon sends."""
+"""The connection to the broker transmits a tenth of the bytes that the daemon sends."""
 
 from __future__ import annotations
 

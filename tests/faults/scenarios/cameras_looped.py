@@ -37,7 +37,7 @@ async def run(gateway: Gateway) -> Outcome:
 
 
 SCENARIO = Scenario(
-    title="recording played in a loop",
+    title="camera software that plays a recording in a loop",
     reported="`bridge/event`; `restarts` of the device",
     continues="poses from the sensors; the frames are not used",
     counted="nothing, because a repeated frame is not a loss; the figure is `lost` of the device",

@@ -27,7 +27,7 @@ async def run(gateway: Gateway) -> Outcome:
     cameras.server.restart()
     await asyncio.sleep(0.5)
     recovered_s = await gateway.streaming("mocap")
-    await asyncio.sleep(1.5)  # it works again: the next fault is paused for the shortest time
+    await asyncio.sleep(1.5)  # a working server resets the pause between attempts
     return Outcome(noticed_s, recovered_s, gateway.pose_gap_s(since), 0)
 
 

@@ -1,4 +1,4 @@
-"""The operator adds a skeleton whose marker set has the names of the rigid body's."""
+"""The operator adds a skeleton whose markers have the same names as those of the rigid body."""
 
 from __future__ import annotations
 

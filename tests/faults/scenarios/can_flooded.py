@@ -1,4 +1,4 @@
-"""Strangers send at the full rate of the bus beside the sensor."""
+"""Other devices on the bus of the sensor send at the full rate of the bus."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STRANGERS = (0x000, 0x010, 0x123, 0x456, 0x7FF, 0x18FF1234)
 
 
 async def run(gateway: Gateway) -> Outcome:
-    """Send frames of strangers at 500 kbit/s for three seconds."""
+    """Send frames of other devices at 500 kbit/s for three seconds."""
     since, before = len(gateway.listener.poses), await gateway.device("S3")
     sent, bus, source = gateway.can.device.sent, gateway.can.bus, random.Random(2)
     began_s, frames = time.monotonic(), 0

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 async def run(gateway: Gateway) -> Outcome:
-    """Unplug S1, take all free descriptors away, and give them back."""
+    """Unplug S1, use all free descriptors of the daemon, and release them."""
     since, device = len(gateway.listener.poses), gateway.sensors["S1"].device
     device.unplug()
     await gateway.seconds(lambda: "S1" not in gateway.listener.online)

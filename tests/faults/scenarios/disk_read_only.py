@@ -34,7 +34,7 @@ async def run(gateway: Gateway) -> Outcome:
 
 
 def remount(gateway: Gateway, mode: str) -> None:
-    """Mount the file system of the recordings anew in the daemon's namespace."""
+    """Mount the file system of the recordings again in the daemon's namespace."""
     inside = ["nsenter", "-t", str(gateway.pid), "-U", "-m", "--preserve-credentials"]
     place = str(gateway.folder / "recordings")
     subprocess.run([*inside, "mount", "-o", f"remount,{mode}", place], check=True)

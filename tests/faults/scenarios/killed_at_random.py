@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from tests.faults.gateway import Gateway
 
 MOMENTS = random.Random(11)
-"""Another moment in each run, the same ones in each series."""
+"""Source of the random moments. Every series of runs has the same moments."""
 
 
 async def run(gateway: Gateway) -> Outcome:

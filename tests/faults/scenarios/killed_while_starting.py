@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from tests.faults.gateway import Gateway
 
 MOMENTS = random.Random(7)
-"""Another moment and signal in each run, the same ones in each series."""
+"""Source of the random moments and signals, which are the same in every series of runs."""
 
 
 async def run(gateway: Gateway) -> Outcome:

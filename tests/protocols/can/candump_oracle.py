@@ -1,4 +1,4 @@
-"""Second reader of ``candump -L`` logs (can-utils), for comparison with the one of the daemon.
+"""Second reader of ``candump -L`` logs (can-utils), for comparison with the daemon's reader.
 
     (1436509052.249713) vcan0 044#2A366C2BBA        (time) interface id#data
     (1436509052.449847) vcan0 0F6#R                 remote request

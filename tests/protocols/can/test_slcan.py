@@ -55,13 +55,13 @@ def test_chunking_changes_neither_messages_nor_losses(wire: bytes, role: Role) -
 
 
 @given(wires, roles)
-def test_no_more_is_lost_than_came(wire: bytes, role: Role) -> None:
+def test_no_more_bytes_are_lost_than_arrived(wire: bytes, role: Role) -> None:
     messages, lost = decoded([wire], role)
     assert lost + len(messages) <= len(wire)
 
 
 @given(st.lists(can_frames), st.booleans())
-def test_frames_come_back_in_both_roles(frames: list[CanFrame], timed: bool) -> None:
+def test_frames_survive_a_round_trip_in_both_roles(frames: list[CanFrame], timed: bool) -> None:
     wire = b"".join(encode_frame(frame, 59_999 if timed else None) for frame in frames)
     for role in ("host", "adapter"):
         assert decoded([wire], role) == (frames, 0)
@@ -73,13 +73,13 @@ def test_a_frame_behind_noise_is_not_lost(noise: bytes, frame: CanFrame) -> None
 
 
 @given(st.binary(max_size=5000))
-def test_what_waits_is_bounded(data: bytes) -> None:
+def test_pending_bytes_are_bounded(data: bytes) -> None:
     decoder = SlcanCodec(115_200)
     decoder.feed(data.replace(b"\r", b"x"), 0)
     assert sum(item.discarded for item in decoder.flush()) <= 64
 
 
-def test_digits_are_taken_strictly() -> None:
+def test_other_characters_than_hexadecimal_digits_are_refused() -> None:
     for bad in (b"t0212AB C\r", b"t021 2ABCD\r", b"t+212ABCD\r", b"t0_12ABCD\r", b"t0212ABCG\r"):
         messages, lost = decoded([bad])
         assert not messages

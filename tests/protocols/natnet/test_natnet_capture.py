@@ -150,7 +150,7 @@ _THE_END = "Device [Count"
 
 
 def printed(capture: Path) -> Iterator[list[list[float]]]:
-    """Yield the numbers of each line of each frame; the program's own messages lie between."""
+    """Yield the numbers of each line of each frame, without the other messages of the program."""
     text = (capture / "raw" / "SampleClient_output.txt").read_text(encoding="utf-8")
     for block in text.split("FrameID : ")[1:]:
         lines = ("frame " + block).partition(_THE_END)
@@ -160,7 +160,7 @@ def printed(capture: Path) -> Iterator[list[list[float]]]:
 
 
 def as_printed(frame: FrameOfData) -> list[list[float]]:
-    """Return the numbers the vendor's client prints of a frame, line by line."""
+    """Return the numbers that the vendor's client prints for a frame, line by line."""
     body = frame.bodies[0]
     ms = 1e3 / HZ
     lines: list[list[float]] = [

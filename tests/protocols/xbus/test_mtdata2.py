@@ -89,7 +89,7 @@ def test_reals_come_back_within_half_a_step(
 
 
 @given(st.data(), st.sampled_from(sorted(COUNTS)))
-def test_counts_come_back(data: st.DataObject, item: Item) -> None:
+def test_counts_survive_a_round_trip(data: st.DataObject, item: Item) -> None:
     number = data.draw(st.integers(0, 2 ** COUNTS[item] - 1))
     wire = mtdata2.encode_item(item, number)
     assert mtdata2.decode_item(item, wire[3:]) == number
@@ -104,7 +104,7 @@ def test_counts_come_back(data: st.DataObject, item: Item) -> None:
         st.integers(0, 2**16 - 1),
     )
 )
-def test_edges_come_back(edge: Trigger) -> None:
+def test_edges_survive_a_round_trip(edge: Trigger) -> None:
     wire = mtdata2.encode_item(Item.TRIGGER_IN1, edge)
     assert wire[:3] == b"\x48\x10\x08"
     assert mtdata2.decode_item(Item.TRIGGER_IN1, wire[3:]) == edge
@@ -155,7 +155,7 @@ def test_counts_and_positions_have_the_documented_sizes() -> None:
         assert mtdata2.decode_item(item, bytes(size + 1)) is None
 
 
-def test_utc_time_comes_back() -> None:
+def test_utc_time_survives_a_round_trip() -> None:
     time = UtcTime(123_456_789, 2019, 1, 20, 17, 2, 3, 7)
     wire = mtdata2.encode_item(Item.UTC_TIME, time)
     assert mtdata2.decode_item(Item.UTC_TIME, wire[3:]) == time

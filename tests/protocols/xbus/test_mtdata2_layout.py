@@ -1,4 +1,4 @@
-"""A layout says what reading item by item says, or nothing."""
+"""Decoding by a layout gives the same result as decoding item by item, or no result."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def one_by_one(data: bytes) -> dict[int, Value]:
 def test_the_next_message_reads_as_item_by_item(data: st.DataObject, ids: list[int]) -> None:
     first, second = data.draw(items(ids)), data.draw(items(ids))
     layout = MTData2Layout.of(split(first) or [], WANTED)
-    if {0x2011, 0x2013} & {*ids}:  # fixed point and doubles take the long way
+    if {0x2011, 0x2013} & {*ids}:  # fixed point and doubles are decoded item by item
         assert layout is None
         return
     assert layout is not None

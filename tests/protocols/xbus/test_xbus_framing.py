@@ -76,7 +76,7 @@ def test_every_byte_is_in_a_message_or_counted(wire: bytes) -> None:
 
 
 @given(st.lists(st.binary(max_size=3000), max_size=5))
-def test_what_waits_is_bounded(chunks: list[bytes]) -> None:
+def test_pending_bytes_are_bounded(chunks: list[bytes]) -> None:
     decoder = XbusCodec()
     for chunk in chunks:
         decoder.feed(chunk)

@@ -1,4 +1,4 @@
-"""A recording sent by virtual devices gives the recorded measurements in the real drivers."""
+"""Virtual devices send a recording, and the real drivers receive the recorded measurements."""
 
 from __future__ import annotations
 
