@@ -1,7 +1,8 @@
 """Hip and knee centers of recorded trials, estimated and compared with the centers of a model.
 
 Invariant: the estimators receive only the markers of two neighbouring segments: no static trial, no
-regression, no model. Distances are in parent coordinates, in which both centers are constant.
+regression equation, no model. An error is the distance between an estimate and the mean center of
+the model, in the coordinates of the parent segment.
 """
 
 from __future__ import annotations
@@ -51,7 +52,8 @@ class EstimatedCenters:
     model: NDArray[np.float64]
     """Mean center of the model over its frames, in parent coordinates, m."""
     wander: float
-    """RMS distance of the model's center from its mean, m, caused by soft-tissue artefact."""
+    """RMS distance of the model's center from its mean position, m; the cause is soft-tissue
+    artefact."""
     estimates: dict[str, CenterEstimate]
     """Estimates, by method."""
 

@@ -1,4 +1,4 @@
-"""Theory of circle centers for experiments and tests: bounds, and errors of three frames.
+"""Theory of circle centers for experiments and tests: bounds, and errors of centers of 3 frames.
 
 A bound depends on the movement and the noise only. It is infinite if the movement contains no
 information about the center.
@@ -52,12 +52,12 @@ def circle_bound(angles: ArrayLike, noise: float, *, known_radius: bool = False)
 
 
 def circle_rms_bound(angles: ArrayLike, noise: float, *, known_radius: bool = False) -> float:
-    """Return the smallest RMS error of a circle's center, m, with the same parameters."""
+    """Return the smallest RMS error of a circle's center, m; parameters as in `circle_bound`."""
     return float(np.sqrt(np.trace(circle_bound(angles, noise, known_radius=known_radius))))
 
 
 def arbitrary_error(angles: ArrayLike, noise: ArrayLike) -> Array:
-    r"""Predict the RMS error of a three-frame center for three angles.
+    r"""Predict the RMS error of a center from three frames, given their three angles.
 
     .. math::
         E^2 = \frac{2\sigma^2 (3 - \cos\theta_{12} - \cos\theta_{13} - \cos\theta_{23})}
@@ -81,13 +81,13 @@ def arbitrary_error(angles: ArrayLike, noise: ArrayLike) -> Array:
     d12, d13, d23 = t[..., 0] - t[..., 1], t[..., 0] - t[..., 2], t[..., 1] - t[..., 2]
     across = np.sin(d12) - np.sin(d13) + np.sin(d23)
 
-    # Half angles give 1 - cos, because the difference of cosines has no precision on short arcs.
+    # 1 - cos is computed from half angles, because the difference is imprecise on short arcs.
     square = 4.0 * (np.sin(d12 / 2) ** 2 + np.sin(d13 / 2) ** 2 + np.sin(d23 / 2) ** 2)
     return _ratio(np.asarray(noise) * np.sqrt(square), np.abs(across))
 
 
 def triangle_error(points: ArrayLike, noise: ArrayLike) -> Array:
-    r"""Predict the RMS error of a three-frame center from the measured triangle alone.
+    r"""Predict the RMS error of a center from three frames, given only the measured triangle.
 
     .. math:: E = \sigma \frac{R}{2A} \sqrt{a^2 + b^2 + c^2}, \qquad R = abc / 4A
 
@@ -114,7 +114,7 @@ def triangle_error(points: ArrayLike, noise: ArrayLike) -> Array:
 
 
 def _ratio(above: Array, below: Array) -> Array:
-    """Return the ratio; without information, the error is infinite for any noise."""
+    """Return above / below, or inf where `below` is 0, that is, without information."""
     lost = below <= 0.0
     return np.where(lost, np.inf, above / np.where(lost, 1.0, below))
 

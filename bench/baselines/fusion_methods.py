@@ -29,7 +29,7 @@ METHODS = ("single", "mean", "markley", "patent6", "patent12", "linear", "anchor
 
 
 class SegmentInputs(NamedTuple):
-    """Inputs of one segment's model."""
+    """Orientations of the sensors, the neighbour and the bone (reference), shape (n, 4) each."""
 
     sensors: list[Array]
     other: Array

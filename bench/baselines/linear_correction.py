@@ -41,9 +41,11 @@ PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 LARGEST = 0.4
 """Largest component of a correction, rad."""
 HULL = 10.0
-"""Multiple of the 0.995 quantile of the training leverage above which the correction fades."""
+"""The correction fades if the leverage of a frame exceeds this multiple of the 0.995 quantile of
+the training leverages."""
 OUTSIDE = 3.0
-"""Multiple of the same quantile above which a frame has the flag ``extrapolating``."""
+"""A frame has the flag ``extrapolating`` if its leverage exceeds this multiple of the same
+quantile."""
 
 
 @dataclass(frozen=True)
@@ -59,14 +61,12 @@ class LinearCorrection(SegmentModel):
     leverage: tuple[tuple[float, ...], ...]
     """Square matrix L. The leverage ``phi @ L @ phi`` is the distance of a frame from the training
     range."""
-    scales: tuple[float, ...]
-    """RMS of each feature in training. It is the scale of a recursive fit."""
     hull_leverage: float
     """0.995 quantile of the leverage in training."""
     mean_leverage: float
     ratio_offset: float
-    """Mean of the leverage ratio + 3 over held-out frames. It makes the mean predicted variance
-    unbiased.
+    """3 plus the mean, over held-out frames, of the leverage divided by the mean training leverage.
+    It makes the mean predicted variance unbiased.
     """
     covariance: tuple[tuple[float, ...], ...]
     """Mean outer product of held-out residuals, rad^2, 3x3, segment axes."""
@@ -137,7 +137,7 @@ def fit_linear_correction(training: SegmentTraining) -> LinearCorrection:
     Raises
     ------
     ValueError
-        The trial has no neighbouring segment.
+        `training` contains no neighbouring segment.
     """
     if training.q_other is None:
         raise ValueError("the linear correction needs a sensor of the neighbouring segment")
@@ -153,7 +153,6 @@ def fit_linear_correction(training: SegmentTraining) -> LinearCorrection:
         weights=tuple(weights.tolist()),
         coefficients=_tuples(ridge.coefficients.T.tolist()),
         leverage=_tuples(ridge.leverage.tolist()),
-        scales=tuple(ridge.scales.tolist()),
         hull_leverage=float(np.quantile(h, 0.995)),
         mean_leverage=float(np.mean(h)),
         ratio_offset=float(np.mean(held.leverage_ratios)) + 3.0,
@@ -178,16 +177,16 @@ def features(sensors: Sequence[Array], q_other: Array) -> Array:
 
     .. math:: \varphi = [k,\ d_2 \dots d_m,\ |k| \circ k,\ k_1 k_2,\ k_1 k_3,\ k_2 k_3,\ \sin 2k]
 
-    Here :math:`k = \log(x^* \otimes o)` is the joint rotation that the first sensor measures.
-    :math:`d_j = \log(x^* \otimes y_j)` is the deviation of the first sensor from each further
-    sensor. All values are in rad.
+    Here :math:`k = \log(x^* \otimes o)` is the joint rotation between the first sensor x and the
+    neighbour o. :math:`d_j = \log(x^* \otimes y_j)` is the rotation from the first sensor to
+    sensor :math:`y_j`. All values are in rad.
 
     Parameters
     ----------
     sensors : sequence of ndarray, shape (n, 4)
-        Bone-aligned sensors of the segment.
+        Orientations of the sensors of the segment, aligned to the bone.
     q_other : ndarray, shape (n, 4)
-        Bone-aligned sensor of the neighbouring segment.
+        Orientation of the neighbouring segment, from its sensors aligned to the bone.
     """
     inverse = rotation.conjugate(sensors[0])
     k = rotation.log(rotation.multiply(inverse, q_other))

@@ -42,8 +42,8 @@ def still_from_rates(
 ) -> Mask:
     """Return whether each sample is at rest, from raw data in centered windows.
 
-    A sample is a candidate if the root of the summed variances over its window is below both
-    limits. Runs of candidates shorter than ``shortest_s`` are dropped.
+    A sample is a candidate if the roots of the summed variances of rate and specific force over its
+    window are below their limits. Runs of candidates shorter than ``shortest_s`` are dropped.
 
     Parameters
     ----------
@@ -84,7 +84,8 @@ def still_from_orientation(
     Returns
     -------
     ndarray of bool, shape (n,)
-        The first and the last half window have the value of the first or last complete window.
+        The samples of the first (last) half window have the value of the first (last) complete
+        window.
     """
     limits = limits or RecordedStillnessLimits()
     q = rotation.continuous(q_world_sensor)
@@ -125,7 +126,7 @@ def _moving_spread(samples: ArrayLike, size: int) -> NDArray[np.float64]:
 
 
 def _moving_mean(values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Return the means of `size` rows centered at each row; the end rows are repeated.
+    """Return the means of `size` rows centered at each row; end rows are repeated beyond the ends.
 
     The means are computed from running sums.
     """

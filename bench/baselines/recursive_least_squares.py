@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 EXCITATION = 1e-3
-"""Threshold of g^T P g. A sample below it does not excite the fit, and forgetting would only
-increase P.
+"""Threshold of the excitation g^T P g (see `RecursiveLeastSquares`). A sample below it contains
+almost no new information, and its update with forgetting would only increase P.
 """
 IDLE_SAMPLES = 100
 """Number of successive samples below `EXCITATION` of which one is used in any case. At 100 Hz,

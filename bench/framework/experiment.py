@@ -2,7 +2,7 @@
 
 A module of ``bench.experiments`` lists its experiments in a tuple ``EXPERIMENTS``. Experiments use
 seeded random generators and read recordings. The recordings are in a folder next to the checkout,
-and never part of the checkout. If recordings or packages of an experiment are missing, the
+and never part of the checkout. If recordings or packages that an experiment needs are missing, the
 experiment is skipped with the reason.
 """
 
@@ -94,7 +94,7 @@ class Experiment:
     """Reasons why results currently miss their thresholds, by name of the result."""
 
     def unexpected(self, results: list[Result], *, shared_machine: bool = False) -> list[Result]:
-        """Return the results that unexpectedly miss their threshold, most important first.
+        """Return the results that unexpectedly miss their thresholds, in their order.
 
         With `shared_machine`, the times of `timed` experiments may be `ALLOWED_SLOWDOWN` longer.
         """

@@ -50,7 +50,7 @@ _SIZE = re.compile(r".*: (?:frame )?(\d+)")
 
 
 def growth_plot() -> str:
-    """Return the drawing of the stored results."""
+    """Return the drawing of the stored results as SVG."""
     parts = [_text(LEFT, 34, "CPU time of a frame, µs (logarithmic axes)", "title")]
     for index, (_, label, color) in enumerate(CURVES):
         parts.append(_text(LEFT + 215 * index, 64, label, f"name {color}"))
@@ -99,7 +99,7 @@ def _flat_panel() -> list[str]:
 
 
 def _points(name: str) -> Points:
-    """Return sizes and values of the results whose names are sizes."""
+    """Return sizes and values of the results whose names end with a size."""
     results = storage.results_of(storage.load(name))
     return [
         (float(found[1]), result.value)

@@ -15,12 +15,14 @@ class Material(NamedTuple):
 SEEDED = Material("none; random numbers with a fixed seed", "true values, known by construction")
 KNEE = Material(
     "1 adult (OpenCap subject 4), right leg, 4 virtual IMUs (orientations of skin-marker "
-    "clusters plus recorded errors of real orientation filters, in one assignment to the sensors)",
+    "clusters plus recorded errors of real orientation filters, with one assignment of errors to "
+    "sensors)",
     "musculoskeletal model fitted to other markers",
 )
 BOTH_KNEES = Material(
     "1 adult (OpenCap subject 4), both legs, 8 virtual IMUs (orientations of skin-marker "
-    "clusters plus recorded errors of real orientation filters, in one assignment to the sensors)",
+    "clusters plus recorded errors of real orientation filters, with one assignment of errors to "
+    "sensors)",
     "inverse kinematics of the subject's model without the markers of thighs and shanks",
 )
 EXCHANGED_KNEES = BOTH_KNEES._replace(
@@ -40,7 +42,8 @@ SIMULATED_MARKERS = Material(
 )
 OPENSIM_OPENCAP = Material(
     "1 adult (OpenCap subject 4)",
-    "OpenSim's InverseKinematicsTool on otherwise unchanged models, with unit weights",
+    "OpenSim's InverseKinematicsTool; only marker positions of the models are changed; all markers "
+    "have the weight 1",
 )
 OPENSIM_GAIT = OPENSIM_OPENCAP._replace(subjects="1 adult (OpenSim gait2354)")
 OPENCAP_CENTERS = OPENSIM_OPENCAP._replace(
@@ -58,7 +61,7 @@ LIVE_RIG = Material(
 THIS_MACHINE = Material("the machine of the run", "CLOCK_MONOTONIC and CPU time of the process")
 RECORDED_LEGS = Material(
     "1 adult (OpenCap subject 4), both legs, 8 virtual IMUs (orientations of skin-marker "
-    "clusters plus recorded filter errors, in eight assignments to the sensors)",
+    "clusters plus recorded filter errors, with eight assignments of errors to sensors)",
     "inverse kinematics of the subject's model without the markers of thighs and shanks; "
     "computed twice, with the fitted marker positions of the model and with the marker "
     "positions of the static trial",

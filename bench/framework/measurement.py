@@ -2,7 +2,7 @@
 
 Invariant: a time is a median over repeated runs. It is also given as a ratio to a fixed loop of
 plain Python in the same run, because machines differ. The threshold is a multiple of the target, so
-only a regression exceeds it.
+only a large slowdown exceeds it.
 """
 
 from __future__ import annotations
@@ -48,9 +48,10 @@ def speed_experiment(
     recordings: tuple[str, ...] = (),
     packages: tuple[str, ...] = (),
 ) -> Experiment:
-    """Return an experiment of ``bench.experiments.speed``; `measure` receives `quick`.
+    """Return an experiment of ``bench.experiments.speed``.
 
-    An experiment that compares settings and has no thresholds can be left out of `make bench`.
+    The argument of `measure` is True in the short run of `make bench`. An experiment that compares
+    settings and has no thresholds can be omitted from this run (`in_short_run` is False).
     """
     return Experiment(
         id,

@@ -45,7 +45,7 @@ ROOT = Path(__file__).resolve().parents[2]
 TEMPLATES = ROOT / "bench" / "pages"
 FIELD = re.compile(r"\{\{(\w+)(?:: *(.*?))?\}\}", re.DOTALL)
 UNITS = {"deg": "°", "us": " µs", "": ""}
-"""Units that are printed differently after a value in text. Other units follow a space."""
+"""Text after a value, by unit. For a unit that is not listed, it is a space and the unit."""
 PIVOT_ROWS = 2
 """Minimum number of rows at which results named ``A: B`` become a table with one row for each A."""
 

@@ -1,7 +1,7 @@
 """Results as JSON files in ``bench/results``, one per experiment.
 
 The files are committed, and the pages of docs are generated from them. They contain no date and no
-path. Values have as many digits as on the pages, so a repeated run changes times only.
+path. Values have as many digits as on the pages, so a repeated run changes measured times only.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MACHINE = "machine"
 
 
 def shown(value: float) -> float:
-    """Return the value rounded as in the tables: to three decimals or three digits."""
+    """Return the value rounded as in the tables: to 3 decimals, or 3 digits if it is below 0.01."""
     value = float(value)
     if 0.0 < abs(value) < 0.01:
         return float(f"{value:.3g}")
@@ -118,7 +118,7 @@ def load(name: str, folder: Path = RESULTS) -> dict[str, Any]:
 
 
 def results_of(content: dict[str, Any]) -> list[Result]:
-    """Return the results in a file; `to_json` converts them to the same content."""
+    """Return the results in the content of a file."""
     return [
         Result(
             name=entry["name"],

@@ -1,8 +1,8 @@
 """Plots of a run: ``python -m bench.plots clocks|joint-centers FOLDER``.
 
-The subject ``clocks`` draws a simulated run with its truth; with ``--replay RECORDING`` it draws a
-recorded run of the daemon. The subject ``joint-centers`` draws the recorded trials with estimated
-and model centers.
+The subject ``clocks`` draws a simulated run with the true clocks, or with ``--replay RECORDING`` a
+recorded run of the daemon. The subject ``joint-centers`` draws the estimated joint centers of the
+recorded trials and the centers of the models.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--replay", type=Path, metavar="RECORDING", help="draw this recorded run")
     options = parser.parse_args(words)
     if options.replay is not None and options.subject != "clocks":
-        parser.error("--replay belongs to clocks")
+        parser.error("--replay needs the subject clocks")
     return draw(options.subject, options.folder, options.replay)
 
 

@@ -121,7 +121,9 @@ def clocks(trace: Trace, about: SimulatedRun) -> Figure:
     offset.axhline(0.0, color="0.8", lw=0.8, zorder=0)
     gaps.set_yticks(range(len(colors)), colors)
     gaps.set_ylim(-0.6, len(colors) - 0.4)
-    gaps.set_xlabel("time, s      (a mark is a run of missing samples; its length is their number)")
+    gaps.set_xlabel(
+        "time, s      (a bar is a run of missing samples; its tick grows with their number)"
+    )
     _legend(figure, colors, offset)
     return figure
 
@@ -163,11 +165,11 @@ def _rate_and_gaps(trace: Trace, name: str, color: str, rate: Axes, gaps: Axes) 
 def delays(trace: Trace, about: SimulatedRun) -> Figure:
     """Draw arrival time minus stamp, which is the delay in excess of the minimum delay.
 
-    With echoes, it is the delay since the exposure.
+    For cameras that answer echo requests, it is the delay since the exposure.
     """
     names = sorted(trace.stamps)
     figure = Figure(figsize=(11, 1.1 + 1.5 * len(names)), layout="constrained")
-    title = f"Delay beyond the fastest sample\n{about.title}"
+    title = f"Delay in excess of the minimum\n{about.title}"
     figure.suptitle(title, fontsize=11, x=0.01, ha="left")
     axes = figure.subplots(
         len(names), 2, squeeze=False, sharey="row", width_ratios=(4, 1)
@@ -198,7 +200,7 @@ def alignment(trace: Trace, about: SimulatedRun) -> Figure:
     """Draw the error of the stamps if the truth is known, and the waiting time of the frames."""
     errors = true_errors(trace, about.taken_ns, about.unseen_ns) if about.taken_ns else {}
     panels = [f"{name}: error, ms" for name in sorted(errors)]
-    note = " (error less the smallest delay, which only the lag shows)" if errors else ""
+    note = " (error minus the minimum transport delay, which no clock observes)" if errors else ""
     figure = _figure(
         f"Alignment{note}",
         [*panels, "frame latency, ms"],
@@ -240,7 +242,7 @@ def _latency(axis: Axes, trace: Trace) -> None:
 def lags(trace: Trace, about: SimulatedRun) -> Figure:
     """Draw the lag windows of every sensor with their sigmas; crosses are rejected windows."""
     names = sorted(trace.lags)
-    figure = _figure("IMU later than cameras, windows of 10 s, ± 2 sigma",
+    figure = _figure("Lag of the IMU after the cameras, windows of 10 s, ± 2 sigma",
                      [f"{name}, ms" for name in names] or ["no optical bodies"], about)  # fmt: skip
     colors = _colors(trace.stamps)
     for axis, name in zip(figure.axes, names, strict=False):
@@ -259,7 +261,7 @@ def lags(trace: Trace, about: SimulatedRun) -> Figure:
         at_s = [(window.at_ns - trace.begin_ns) / NS for window in bad]
         if bad:
             why = bad[0].estimate.refused
-            axis.plot(at_s, [low] * len(bad), "x", color="0.5", label=f"refused: {why}")
+            axis.plot(at_s, [low] * len(bad), "x", color="0.5", label=f"rejected: {why}")
         if name in about.lag_ns:
             truth = (about.lag_ns[name] - trace.latency_ns[name]) / NS_PER_MS
             axis.axhline(truth, color="0.4", lw=0.9, ls="--", label="truth")

@@ -54,8 +54,8 @@ def _title(found: EstimatedCenters) -> str:
     lines = [found.joint.name]
     for method in METHODS:
         e = found.estimates[method]
-        claimed = "refused" if e.refused else f"claimed ±{MM_PER_M * e.sd:.0f}"
-        claimed = "place along the axis unknown" if len(e.unseen) else claimed
+        claimed = "refused" if e.refused else f"claimed ±{MM_PER_M * e.rms_error:.0f}"
+        claimed = "position along the axis unknown" if len(e.unseen) else claimed
         if not np.isfinite(e.center).all():
             lines.append(f"{method}: refused")
             continue
@@ -80,7 +80,9 @@ def _panel(
     turn = np.linspace(0.0, 2.0 * np.pi, 61)
     rest = MM_PER_M * found.wander
     axes.plot(0.0, 0.0, "r+", markersize=12, label="model's center, mean")
-    axes.plot(rest * np.cos(turn), rest * np.sin(turn), "r-", lw=0.8, label="its RMS wander")
+    axes.plot(
+        rest * np.cos(turn), rest * np.sin(turn), "r-", lw=0.8, label="RMS distance from the mean"
+    )
     for color, method in zip(_COLORS, METHODS, strict=False):
         e = found.estimates[method]
         if not np.isfinite(e.center).all():

@@ -1,8 +1,9 @@
 """Core without time measurement: ``python -m bench.rigs.core_frames CALIBRATION FRAMES``.
 
-The bytes of four IMUs at 100 Hz are converted to poses as JSON. Runs of different length show what
-a frame needs, because their start is the same. `CALIBRATION` is a file with a calibration of the
-simulated subject; a fit would take long in an emulation.
+The bytes of four IMUs at 100 Hz are converted to poses as JSON. The start of every run costs the
+same, so the difference between two runs is the cost of their additional frames. `CALIBRATION` is a
+file with a calibration of the simulated subject. It is not fitted here, because a fit takes long in
+an emulation.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Trace of a run: every stamp, every frame, every clock once per second, and every lag.
+"""Trace of a run: every stamp, every frame, every clock twice per second, and every lag.
 
 Invariant: the events pass through the core of the daemon, which is only observed.
 """
@@ -38,7 +38,7 @@ WINDOW_S, HOP_S = 10.0, 2.5
 
 
 class Stamping(NamedTuple):
-    """One sample."""
+    """Stamp of one sample."""
 
     arrival_ns: int
     t_ns: int
@@ -48,7 +48,7 @@ class Stamping(NamedTuple):
 
 
 class Look(NamedTuple):
-    """One clock at one time; None for unknown values."""
+    """State of one clock at one time; None for unknown values."""
 
     at_ns: int
     offset_ns: float | None
@@ -180,7 +180,7 @@ def traced(events: Iterable[Event]) -> Trace:
 
 
 def _lags(trace: Trace) -> dict[str, list[LagWindow]]:
-    """Return the lag windows of every sensor with the best-fitting body."""
+    """Return the lag windows of every sensor, for the body with the most accepted windows."""
     tracks = {name: _track(turns) for name, turns in trace.turns.items()}
     bodies = {name: track for name, track in tracks.items() if "/" in name}
     found: dict[str, list[LagWindow]] = {}
@@ -231,7 +231,7 @@ def true_errors(
     for name, rows in trace.stamps.items():
         known = [row for row in rows if (name, row.ticks) in taken_ns and row.ticks is not None]
         unseen = unseen_ns.get(name, 0)
-        if unseen:  # stamps already lack the assumed delay
+        if unseen:  # the clock has already subtracted the assumed delay
             unseen -= trace.latency_ns[name]
         t_s = np.array([(row.arrival_ns - trace.begin_ns) / NS_PER_S for row in known])
         error = [(row.t_ns - unseen - taken_ns[name, row.ticks or 0]) / 1e6 for row in known]

@@ -56,10 +56,11 @@ class PageCosts:
     paint_ms: list[float]
     """Time of the first contentful paint of a page in a new window, ms."""
     limb_ms: list[float]
-    """Main-thread time of each frame of the limb, ms."""
+    """Main-thread time of each drawing of the limb, ms."""
     curve_ms: list[float]
+    """Main-thread time of each drawing of the curve, ms."""
     seconds: float
-    """Time in which the frames were drawn, s."""
+    """Time in which the limb and the curve were drawn, s."""
 
 
 @asynccontextmanager

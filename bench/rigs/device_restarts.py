@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 SKEWS_PPM = {"S1": 50, "S2": -50, "S3": 31, "S4": -23, OPTICAL: 42}
 DELAY_MS = {"S1": 2.0, "S2": 1.0, "S3": 2.0, "S4": 1.0}
-"""Minimum delay of the simulated transports, ms. Cameras answer echoes and need no value."""
+"""Minimum delay of the simulated transports, ms. Cameras answer echo requests and need no value."""
 EVERY = {*SENSORS, OPTICAL}
 PATIENCE_S = 40.0
 """Time limit for a step, s. On an idle machine, a step takes three seconds."""

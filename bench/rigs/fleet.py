@@ -1,4 +1,4 @@
-"""A fleet of simulated gateways with one broker, measured at the broker and at one station.
+"""A fleet of simulated gateways, one broker, and one station that subscribes to all gateways.
 
 Invariant: the messages were recorded from a real daemon for some seconds. Broker, gateways and
 station are separate processes. The station is this process.
@@ -82,7 +82,7 @@ class Station:
 
 
 async def _length(reader: asyncio.StreamReader) -> int:
-    """Return the length of a packet, which is encoded with 7 bits per byte, lowest first."""
+    """Return the length of an MQTT packet: 7 bits per byte, the lowest bits first."""
     length = shift = 0
     while True:
         byte = (await reader.readexactly(1))[0]

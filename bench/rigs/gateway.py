@@ -106,7 +106,9 @@ class Figures:
     loaded, s."""
     rss_mb: float
     unaccounted: int
-    """Number of samples that were sent but not received, had no outcome, or were dropped."""
+    """Number of samples that were sent but not received, or that have no outcome."""
+    dropped: int
+    """Number of samples with the outcome ``dropped``."""
     received: int
     running_s: float
     first_pose_s: float
@@ -163,6 +165,7 @@ async def run(
         return Figures(
             *measured,
             unaccounted(sent, devices),
+            sum(device["dropped"] for device in devices.values()),
             sum(device["received"] for device in devices.values()),
             (heard.running_s or 0.0) - gateway.began_s,
             (heard.first_pose_s or 0.0) - gateway.began_s,
@@ -278,7 +281,7 @@ async def _measure(
 
 
 async def _last_health(heard: ReceivedMessages) -> dict[str, Any]:
-    """Wait for a health message with all sources offline, when no sample is in transit."""
+    """Wait until the health message reports all sources offline: no sample is then in transit."""
     async with asyncio.timeout(END_S):
         while any(  # noqa: ASYNC110 - the content of a message is the condition
             device["online"] for device in heard.health["devices"].values()
@@ -289,7 +292,10 @@ async def _last_health(heard: ReceivedMessages) -> dict[str, Any]:
 
 
 def unaccounted(sent: dict[str, int], devices: dict[str, dict[str, Any]]) -> int:
-    """Return the number of samples that were not received, or have no outcome."""
+    """Return the number of samples that were not received, or that have no outcome.
+
+    Dropped samples have an outcome, so they do not count.
+    """
     lost = 0
     for name, device in devices.items():
         received = device["received"]

@@ -1,4 +1,4 @@
-"""Senders of a stamp at 100 Hz: `python -m bench.rigs.latency_peers (mqtt PORT TOPIC | lsl NAME)`.
+"""Senders of the time at 100 Hz: `python -m bench.rigs.latency_peers (mqtt PORT TOPIC | lsl NAME)`.
 
 ``mqtt`` is a minimal publisher with aiomqtt; ``lsl`` is an outlet of the Lab Streaming Layer. Each
 sends the current time and as many other bytes as a pose has. Neither receives or computes anything.

@@ -39,7 +39,7 @@ def delays_ns(count: int, blocked_s: float = 0.004) -> tuple[list[int], list[int
     count
         Number of datagrams, one every 2 ms.
     blocked_s
-        Time for which the event loop of the reader is blocked, s, with short pauses in between.
+        Time for which the event loop of the reader is blocked between short pauses, s.
     """
     return asyncio.run(_measure(count, blocked_s))
 
@@ -57,7 +57,7 @@ async def _measure(count: int, blocked_s: float) -> tuple[list[int], list[int]]:
     loop = asyncio.get_running_loop()
     loop.add_reader(opened.fileno(), readable)
     words = [sys.executable, "-c", _SENDER, str(opened.port), str(count)]
-    sender = subprocess.Popen(words)  # noqa: ASYNC220, S603 - our own words; nobody waits for it
+    sender = subprocess.Popen(words)  # noqa: ASYNC220, S603 - a fixed command, which ends by itself
     try:
         async with asyncio.timeout(30 + count * 0.01):
             while len(arrivals) < count:

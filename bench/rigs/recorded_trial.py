@@ -56,7 +56,7 @@ FRAME_NS, MATCH_NS = 10_000_000, 1_000_000
 """Interval between frames, ns, and tolerance of their times, ns. Truth and poses have times at
 multiples of 10 ms of the same clock, apart from rounding."""
 PLAYS, IN_TIME = 3, 0.9
-"""Maximum number of plays, and minimum share of frames in time for a valid play."""
+"""Maximum number of plays, and share of frames without late samples after which no play follows."""
 FADE_NS = 250_000_000
 """Time for which the output fades after a sensor was missing, ns."""
 CONNECT_S, PATIENCE_S = 80.0, 300.0
@@ -212,7 +212,7 @@ async def walking(data: Path, folder: Path, port: int, method: Method) -> Played
     """Restart with the squat calibration in `folder`, and evaluate walking live."""
     files = _files(data, "walking1")
     async with gateway(folder, port, _options(files, WALKING_HZ, method)) as running:
-        await running.connected(2 * SETTLE_S)  # 1 ms causes an error of half a degree
+        await running.connected(2 * SETTLE_S)  # 1 ms of time error causes 0.5° of angle error
         await running.live("trial", 1.3)
     return _judged(running, data, files, method)
 
@@ -357,7 +357,7 @@ def _repeated_deg(running: Gateway) -> float | None:
 def _recorded_truth(path: Path) -> dict[int, list[list[float]]]:
     """Return the orientations of thigh and shank by time, ns.
 
-    Interpolated times have no positions and are omitted.
+    Times during the interpolation between motions have no joint positions and are omitted.
     """
     found = {}
     for line in path.read_text(encoding="utf-8").splitlines()[1:]:
@@ -415,7 +415,7 @@ async def _everything(
 def run(
     data: Path, methods: Sequence[Method], walkers: Sequence[Method] = ()
 ) -> dict[tuple[str, Method], Played]:
-    """Play the squats with one method after another; the methods in `walkers` then walk.
+    """Play the squats with one method after another, and walking with the methods in `walkers`.
 
     A method needs about 35 s, and 10 s more for walking, because trials run in real time. Parallel
     runs would delay each other, and late samples would enter the training.

@@ -1,7 +1,7 @@
 """Malformed and oversized requests at 1 kHz: `python -m bench.rigs.request_flood PORT BASE`.
 
-Invariant: no request is valid. The process is one MQTT 5 client, like an attacker. It prints the
-number of sent requests and the time taken.
+Invariant: no request is valid. One MQTT 5 client sends all of them. The process prints the number
+of sent requests and the time taken.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def kinds(base: str) -> list[tuple[str, bytes, Any]]:
         (topic, b'{"phase":"static","seconds":"long"}', None),
         (topic, b" " * 4097, None),
         (topic, b"[" * 32_000, None),
-        (topic, bytes(40_000), None),  # over the size limit of a packet
+        (topic, bytes(40_000), None),  # larger than the size limit of a packet
         (topic, b'{"phase":"static"}', _properties(ResponseTopic=f"{base}/pose")),
         (topic, b'{"phase":"static"}', _properties(ResponseTopic=root, CorrelationData=bytes(999))),
         (topic, b"[]", _properties(UserProperty=[("name", "x" * 50)] * 20)),

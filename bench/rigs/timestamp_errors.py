@@ -8,7 +8,8 @@ nothing is replaced.
 
 On a loaded machine, samples arrive later. Without a fast sample, no clock can estimate the delay.
 The part of an error with this cause is reported separately (`excused_ns`). It is the additional
-delay of the fastest sample since the clock started, slewed like the stamps.
+delay of the fastest sample since the clock started. It decreases at most at the slew rate of the
+stamps.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Lower limbs of one recorded adult as a chain with seven segments and 20 degrees of freedom.
 
-The chain is built from the standing trial alone. Joint centers are between the markers on both
-sides of a joint, except the hip center, which the recording contains. Axes follow from the centers,
-and markers have their positions in stance. Virtual markers are not tracked.
+The chain is built from the standing trial alone. A joint center is the midpoint of the markers on
+both sides of the joint, except the hip center, which the recording contains. The axes of segments
+follow from the centers, and the positions of markers on their segments are from the standing trial.
+Virtual markers are not tracked.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ def session_events(
     cameras : bool
         Whether the motion-capture server sends.
     silent : tuple of str and two floats, optional
-        A sensor without data, and start and end of this period, s.
+        A sensor that sends nothing in one period, and start and end of this period, s.
     """
     frames: list[Event] = []
     opening: list[Event] = [Configured(START_NS, bench_rig(), worn(), 1)]

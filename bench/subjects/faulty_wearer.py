@@ -103,7 +103,7 @@ def silent(person: SubjectRecording, name: str, at_s: float) -> SubjectRecording
 def slipped(
     person: SubjectRecording, name: str, at_s: float, angle_rad: float, seed: int
 ) -> SubjectRecording:
-    """Return a copy in which a sensor slips in a random direction within 0.3 s."""
+    """Return a copy in which a sensor slips by an angle about a random axis within 0.3 s."""
     axis = np.random.default_rng(seed).normal(size=3)
     axis /= np.linalg.norm(axis)
     share = np.clip((person.t_s - at_s) / 0.3, 0.0, 1.0)
@@ -124,8 +124,8 @@ def pulled(
 ) -> SubjectRecording:
     """Return a copy with a magnetic disturbance: headings deviate for 30 s and return.
 
-    The deviation rises and falls within :data:`PULL_S`, as in a filter with a time constant of
-    seconds.
+    The deviation rises and falls within :data:`PULL_S`, as in an orientation filter with a time
+    constant of a few seconds.
     """
     begin, end = (person.t_s - at_s) / PULL_S, (person.t_s - at_s - PULL_S - STAY_S) / PULL_S
     turn = rotation.heading(angle_rad * (_smooth(begin) - _smooth(end)))
@@ -162,7 +162,10 @@ def segment_orientations(states: Sequence[LimbState], segment: int) -> Array:
 
 
 def jumps(before: Sequence[LimbState], after: Sequence[LimbState], segment: int) -> Array:
-    """Return the change of the output that a fault causes, in predicted RMS errors, shape (n,)."""
+    """Return the change of the output that a fault causes, relative to the predicted RMS error.
+
+    `before` and `after` are the states without and with the fault. The result has the shape (n,).
+    """
     predicted = np.array([state.segments[segment].sd for state in after], dtype=np.float64)
     moved = rotation.angle_between(
         segment_orientations(before, segment), segment_orientations(after, segment)

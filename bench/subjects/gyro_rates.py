@@ -1,4 +1,4 @@
-"""Tracks of measured angular rates, for the lag of a gyroscope instead of a filter."""
+"""Tracks of measured angular rates, to estimate the lag of a gyroscope without its filter."""
 
 from __future__ import annotations
 

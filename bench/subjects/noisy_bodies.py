@@ -1,6 +1,7 @@
 """Two simulated bodies with a ball joint, observed by noisy markers on soft tissue.
 
-Invariant: the joint is the origin of the parent. All random numbers are from the given generator.
+Invariant: the joint is at the origin of the parent frame. All random numbers are from the given
+generator.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class Subject:
 
     @classmethod
     def random(cls, rng: np.random.Generator, markers: int) -> Subject:
-        """Return a subject with clusters of width `WIDTH_M`, `AWAY_M` from the joint."""
+        """Return a subject with clusters of width `WIDTH_M` at `AWAY_M` from the joint."""
         above, below = (_cluster(rng, markers, sign * AWAY_M) for sign in (1.0, -1.0))
         return cls(above, below, rng.uniform(0.0, 2.0 * np.pi, 3))
 

@@ -185,12 +185,12 @@ class OpenSimTracker:
         return model
 
     def begin(self, number: int) -> None:
-        """Find the pose of a frame from the neutral pose."""
+        """Solve for the pose of a frame, starting from the neutral pose."""
         self._state.setTime(self.t_s[number])
         self._solver.assemble(self._state)
 
     def track(self, number: int) -> list[float]:
-        """Return the flexion angles of a frame, rad, from the pose of the frame before."""
+        """Return the flexion angles of a frame, rad; the solver starts from the previous frame."""
         self._state.setTime(self.t_s[number])
         self._solver.track(self._state)
         return [coordinate.getValue(self._state) for coordinate in self._coordinates]

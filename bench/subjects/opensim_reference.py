@@ -1,8 +1,8 @@
 """Inverse kinematics of OpenSim, the reference for refined marker sets.
 
-Invariant: joints, scaling and weights of the model are those of its file. Only the marker positions
-on their bodies are replaced. Forces are removed, because they need time and inverse kinematics does
-not use them.
+Invariant: joints and scaling of the model are those of its file. Only the positions of the markers
+on their bodies are replaced. All markers have the weight 1. Forces are removed, because they need
+time and inverse kinematics does not use them.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Verdict:
 
 
 def trial_frames(path: Path, names: Sequence[str], every: int = 1) -> MarkerTrajectories:
-    """Return some markers and frames of a TRC file, in the axes of the file."""
+    """Return the markers `names` in each `every`-th frame of a TRC file, in the file's axes."""
     trial = read_trc(path)
     at = [trial.names.index(name) for name in names]
     return MarkerTrajectories(
@@ -179,14 +179,14 @@ class OpenSimFollower:
         self.runs = 0
 
     def __call__(self, positions: NDArray[np.float64], _weights: Any = None) -> Carriers:
-        """Return the poses of the marker bodies in every frame."""
+        """Return the poses of the bodies that carry the markers, in every frame."""
         poses, _ = self._run(positions)
         at = [sorted(set(self._segments)).index(s) for s in self._segments]
         turned = poses[:, at][:, :, [2, 0, 1]]  # y up to z up
         return Carriers(turned[..., [2, 0, 1]], turned[..., 3])
 
     def tracking_error(self, positions: NDArray[np.float64]) -> float:
-        """Return the RMS distance after inverse kinematics, m."""
+        """Return the RMS distance of model and measured markers after inverse kinematics, m."""
         return float(np.sqrt(self._run(positions, poses=False)[1].mean()))
 
     def _run(

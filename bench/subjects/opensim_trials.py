@@ -1,7 +1,7 @@
 """Trials and unchanged OpenSim models for the evaluation of refined markers.
 
-Invariant: training and evaluation trials have different names, and a chain is made from the model
-alone. All markers are free, including markers that a model marks as fixed.
+Invariant: a chain is made from the model alone. All markers are free, including markers that a
+model marks as fixed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Simulated runs of planar centers of rotation, computed together, and their evaluation."""
+"""Estimates of planar centers of rotation from many simulated arcs, and their evaluation."""
 
 from __future__ import annotations
 
@@ -62,7 +62,10 @@ def runs_on(
     tempered: bool = True,
     correlated: bool = False,
 ) -> Runs:
-    """Fit `runs` noisy arcs of `n` equidistant points over `arc` degrees, ends included."""
+    """Return the fits of `runs` noisy arcs of `n` equidistant points over `arc` degrees.
+
+    Both ends of an arc are points. `noise` is the standard deviation of a coordinate, m.
+    """
     rng = np.random.default_rng(round(1000 * arc) + n)
     t = np.linspace(-0.5, 0.5, n) * np.deg2rad(arc)
     truth = arc_points(t, radius)
@@ -79,7 +82,7 @@ def runs_on(
 
 
 def upper_rms(found: Runs) -> float:
-    """Return the upper 95 % limit of the RMS error, from the scatter of the squared errors."""
+    """Return the upper 95 % confidence limit of the RMS error, m, from the squared errors."""
     square = (found.centers**2).sum(axis=1)
     square = square[np.isfinite(square)]
     return float(np.sqrt(square.mean() + 1.645 * square.std() / np.sqrt(len(square))))

@@ -1,4 +1,4 @@
-"""Raw readings as bytes of an Xbus device, and two board trials with optical truth."""
+"""Raw readings as bytes of an Xbus device, and two board trials with optical ground truth."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Recorded knee: soft-tissue artefact and filter errors of four virtual sensors, and a bone model.
 
-The module loads `semireal_knee4imu` in the conventions of the project, and computes errors like the
-tables of that data set.
+The module loads `semireal_knee4imu` in the conventions of the project. It computes errors in the
+same way as the tables of that data set.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ TRAINING_SHARE = 0.6
 
 @dataclass(frozen=True, slots=True)
 class KneeTrial:
-    """One movement; only frames with all markers are included."""
+    """Frames of one movement with all markers; `thigh` and `shank` are the reference, (n, 4)."""
 
     sensors: tuple[Array, Array, Array, Array]
     """Bone-aligned orientations q_world_segment of S1 and S2 (thigh) and S3 and S4 (shank), shape

@@ -1,10 +1,9 @@
-"""Both legs of a recorded adult with soft-tissue artefact, eight deals of filter errors, and two
-references.
+"""Both legs of a recorded adult, with eight assignments of filter errors and two references.
 
-The module loads `semireal_knee4imu_v2`. Its two references are solutions of the same model, with
-fitted markers and with markers from the static trial. They differ by up to 20 deg about the long
-axis of the thigh. If only one reference shows an improvement, the method may only fit the error of
-that reference.
+The module loads `semireal_knee4imu_v2`, which contains soft-tissue artefact. The two references are
+solutions of the same model, with fitted marker positions and with those of the static trial. They
+differ by up to 20 deg about the long axis of the thigh. If only one reference shows an improvement,
+the method may only fit the error of that reference.
 """
 
 from __future__ import annotations
@@ -61,7 +60,7 @@ def recorded_leg(data: Path, movement: str, case: LegCase) -> KneeTrial:
 
 
 def _orientations(data: Path, movement: str, case: LegCase) -> tuple[list[Array], list[Array]]:
-    """Return q_world_sensor of the four sensors, and q_world_bone of the bone under each."""
+    """Return q_world_sensor of each of the four sensors, and q_world_bone of its bone."""
     letter, suffix = LEGS[case.leg], REFERENCES[case.reference]
     with np.load(data / FOLDER / f"{movement}.npz", allow_pickle=False) as arrays:
         skin = rotation.normalize(arrays[f"q_skin_{letter}"].astype(float))

@@ -1,6 +1,7 @@
 """Simulated joints: true paths, noisy markers, and frames fitted to the markers.
 
-Invariant: the center is the origin of the parent. All random numbers are from the given generator.
+Invariant: the center is at the origin of the parent frame. All random numbers are from the given
+generator.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class Seen:
 
 
 def ball_turns(rng: np.random.Generator, rom_deg: float, n: int = 200) -> Array:
-    """Return rotation matrices in all directions, shape (n, 3, 3)."""
+    """Return the matrices of random rotations about all axes, shape (n, 3, 3)."""
     h = np.radians(rom_deg) / 2
     a, phi = h * np.sqrt(rng.uniform(size=n)), rng.uniform(0, 2 * np.pi, n)
     vectors = np.stack((a * np.cos(phi), a * np.sin(phi), rng.uniform(-h, h, n)), axis=1)
@@ -66,7 +67,7 @@ def carried(turns: Array, markers: Array = CHILD) -> Array:
 
 
 def fan(arc_deg: float, n: int = 100) -> Array:
-    """Return paths of four markers in a plane at different angles about the joint, (n, 4, 2)."""
+    """Return paths of four markers in a plane at different angles about the joint, m, (n, 4, 2)."""
     theta = np.linspace(0.0, np.radians(arc_deg), n)[:, None] + np.array(OFFSETS)
     return np.asarray(np.array(RADII)[:, None] * np.stack((np.cos(theta), np.sin(theta)), axis=-1))
 
@@ -80,7 +81,7 @@ def watched(
     template_error: float = 0.0,
     frame: Array = PARENT,
 ) -> Seen:
-    """Move parent and child, and observe both with noisy markers."""
+    """Return an observation of a moving parent and its child by noisy markers."""
     n = len(turns)
     moved = rotation.to_matrix(rotation.exp(rng.normal(0, 0.1, (n, 3))))
     t = rng.normal(0, 0.05, (n, 3))

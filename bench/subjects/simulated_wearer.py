@@ -41,8 +41,8 @@ MOVES = {
 """Motions of the functional calibration, by limb. All motions have the same duration."""
 PLATE_S, STAND_S, FUNCTIONAL_S = 24.0, 9.0, 60.0
 _CAN_BLOCKS = 7
-"""Number of blocks of 256 identifiers in the range of 11-bit identifiers."""
-_LEAD_S = 2.0  # end of the transition between two motions
+"""Number of the last block of 256 identifiers in the range of 11-bit identifiers."""
+_LEAD_S = 2.0  # time after the start of a motion that is not used because of the transition
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Phases:
 
 @cache
 def phases(seed: int = 1, rate_hz: float = 100.0, limb: str = "leg") -> Phases:
-    """Return the trials of one subject: 22 s of plate, 7 s of standing, 60 s of movement."""
+    """Return the trials of one subject: 22 s on the plate, 7 s of standing, 60 s of movement."""
     return phases_of(Knobs(seed=seed, rate_hz=rate_hz), limb)
 
 

@@ -56,8 +56,8 @@ SENSORS = {
 """Three markers for each sensor. The left shank has only three markers, so its two sensors share
 them."""
 MEDIAL = ("r_mknee", "r_mankle", "L_mknee", "L_mankle")
-"""Markers that only the static trial contains. With these markers, the bones would differ in other
-trials.
+"""Markers that only the static trial contains. They are not tracked, because the bones of the
+static trial would then differ from the bones of other trials.
 """
 
 

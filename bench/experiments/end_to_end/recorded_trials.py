@@ -1,6 +1,6 @@
-"""Recorded trials replayed as bytes through the daemon, compared with the offline results.
+"""Recorded trials replayed as bytes through the daemon, compared with the offline evaluation.
 
-The expected value of each result is the result of the same session offline, at the same frames. The
+The expected value of each error is the error of the offline evaluation at the same frames. The
 tolerance is 0.1°.
 """
 
@@ -26,8 +26,7 @@ METHODS: tuple[Method, ...] = ("mean", "patent12", "patent6", "anchored")
 WALKERS: tuple[Method, ...] = ("patent12", "patent6", "anchored")
 ALLOWED_DEG = 0.1
 REPEATED_DEG = 0.01
-"""Largest accepted angle between `pose` and the regression of the patent from MQTT messages, deg.
-"""
+"""Largest accepted angle between `pose` and the patent's regression of `sensors/pose`, deg."""
 
 
 @cache

@@ -57,8 +57,8 @@ class Wearer:
     calibration: Calibration
     track: OpticalTrack
     forward: Array
-    """Forward direction of the thigh in each tested frame, shape (m, 3). The markers are moved
-    along it."""
+    """Forward direction of the thigh in each tested frame, shape (m, 3). The markers are moved in
+    this direction."""
 
 
 @cache
@@ -133,7 +133,7 @@ def followed(one: Wearer, moved_m: float) -> list[tuple[float, RunningCenter]]:
 
 
 def moving(tissue_mm: float, shifts_mm: tuple[float, ...], _: Path) -> list[Result]:
-    """Count false reports without a shift, and reports of each shift; measure each shift."""
+    """Measure false reports without a shift, and the reports and the error of each shift."""
     shares, offsets = [], []
     for seed in WEARERS:
         still = [center for _, center in followed(wearer(seed, tissue_mm), 0.0)]

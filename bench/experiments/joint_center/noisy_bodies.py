@@ -1,4 +1,4 @@
-"""Centers between two bodies with noisy markers: coverage and error, by movement and markers."""
+"""Joint centers between two bodies with noisy markers: coverage of ellipsoids, and errors."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def measure_gate(runs: int) -> list[Result]:
     trials = [exact + rng.normal(0.0, 2e-3, exact.shape) for _ in range(runs)]
     results = []
     for label, limit in (("without limit", inf), ("limit of 20 mm", 0.02)):
-        found = [circle_estimate(points, limits=CircleLimits(sd=limit)) for points in trials]
+        found = [circle_estimate(points, limits=CircleLimits(rms_error=limit)) for points in trials]
         used = [e for e in found if e.refused is None]
         rejected = 100.0 * (1.0 - len(used) / runs)
         outward = MM_PER_M * float(np.mean([e.center[0] for e in used]))

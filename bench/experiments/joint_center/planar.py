@@ -44,7 +44,7 @@ WIDE = CircleLimits(0.0, (0.0, np.inf), 0.0, np.inf)
 
 
 def three_frames(_: Path) -> list[Result]:
-    """Compare the closed form with Cramer's rule, and with a misprinted denominator at 1 m."""
+    """Measure the closed form against Cramer's rule, and the error of the misprinted equation."""
     rng = np.random.default_rng(1)
     p = rng.uniform(-1.0, 1.0, (30_000, 3, 2))
     u, v = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
@@ -62,7 +62,7 @@ def three_frames(_: Path) -> list[Result]:
 
 
 def _as_printed(rng: np.random.Generator) -> float:
-    """Return the RMS error if (x1 - x2) replaces (x1 - x3), at 60° and 1 mm, m."""
+    """Return the RMS error, m, if (x1 - x2) replaces (x1 - x3): steps of 60°, noise of 1 mm."""
     p = arc_points(np.deg2rad(60.0) * np.arange(3), 0.2) + rng.normal(0, 0.001, (20_000, 3, 2))
     x, y, s = p[..., 0], p[..., 1], (p**2).sum(axis=-1)
     above = (s[:, 1] - s[:, 0]) * (y[:, 2] - y[:, 0]) - (s[:, 2] - s[:, 0]) * (y[:, 1] - y[:, 0])
@@ -71,7 +71,7 @@ def _as_printed(rng: np.random.Generator) -> float:
 
 
 def equal_steps(_: Path) -> list[Result]:
-    """Compare equation 15 with 200 000 runs."""
+    """Compare the predicted error (equation 15) with 200 000 simulated runs."""
     figures = []
     for step in (45, 60, 90, 120, 150):
         rng = np.random.default_rng(step)
@@ -90,7 +90,7 @@ SIX_NOISES_M = 1e-3 * np.array([[0.3, 1.2], [0.8, 0.4], [1.5, 0.6]])
 
 
 def unequal_noise(_: Path) -> list[Result]:
-    """Compare mean squares along x and y for six standard deviations, and for one per frame."""
+    """Compare simulated with predicted errors for six standard deviations, and one per frame."""
     t = np.array([0.3, 1.4, 2.9])
     drawn = np.random.default_rng(5).normal(size=(400_000, 3, 2))
     figures = []
@@ -105,7 +105,7 @@ def unequal_noise(_: Path) -> list[Result]:
 
 
 def forms(_: Path) -> list[Result]:
-    """Compare equation 14, from angles and from side lengths, with the Cramér-Rao bound."""
+    """Compare two forms of equation 14, by angles and by side lengths, and the Cramér-Rao bound."""
     rng = np.random.default_rng(3)
     t = np.sort(rng.uniform(0.0, 2.0 * np.pi, (500, 3)), axis=1)
     t = t[np.diff(t, axis=1).min(axis=1) > 0.2]
@@ -153,7 +153,7 @@ def streaming(_: Path) -> list[Result]:
         batch, live = circle_estimate(p[last], weights[last]), running.estimate()
         off = np.abs(batch.center - live.center).max()
         figures.append(Result(f"{name}: center", float(off), 1e-9, unit="m"))
-        off_sd = abs(batch.sd - live.sd)
+        off_sd = abs(batch.rms_error - live.rms_error)
         figures.append(Result(f"{name}: predicted error", float(off_sd), 1e-9, unit="m"))
     running, began = RunningCircle(), time.thread_time()
     for x, y in p.tolist():

@@ -60,7 +60,7 @@ def table_1(_: Path) -> list[Result]:
 
 
 def repeated_rotations(_: Path) -> list[Result]:
-    """Compare two means of repeated three frames: of the centers, and of the marker positions."""
+    """Compare the mean of the centers of all repetitions with the center of the mean positions."""
     found = average_repetitions(StudySetup())
     figures: list[Result] = []
     for step, centers, positions in zip(np.rad2deg(STEPS_RAD), *found, strict=True):

@@ -41,7 +41,7 @@ def compare(trial: str, data: Path) -> list[Result]:
             name = f"{found.joint.name}, {e.method}"
             if e.refused is not None:
                 name += " (rejected)"
-            figures.append(Result(f"{name}: stated error", 1000 * e.sd, inf, unit="mm"))
+            figures.append(Result(f"{name}: stated error", 1000 * e.rms_error, inf, unit="mm"))
             if np.isfinite(e.center).all():
                 told = 1000 * found.told_across(method)
                 figures.append(

@@ -67,7 +67,7 @@ def four_markers(_: Path) -> list[Result]:
     rng = np.random.default_rng(7)
     truth, noise = fan(20.0), 2e-3
     bound = np.sqrt(sphere_bound(truth, noise))
-    anyhow = CircleLimits(gate=0.0, arc=0.0, sd=inf)
+    anyhow = CircleLimits(gate=0.0, arc=0.0, rms_error=inf)
     fused, joint = [], []
     for _run in range(400):
         seen = truth + rng.normal(0, noise, truth.shape)
@@ -105,7 +105,7 @@ def frame_by_frame(_: Path) -> list[Result]:
     off = float(np.abs(live.center - batch.center).max())
     return [
         Result("center", off, 1e-9, unit="m"),
-        Result("predicted error", abs(live.sd - batch.sd), 1e-9, unit="m"),
+        Result("predicted error", abs(live.rms_error - batch.rms_error), 1e-9, unit="m"),
     ]
 
 
@@ -161,7 +161,7 @@ def hinge_axis(_: Path) -> list[Result]:
         off.append(np.array([*found.center[:2], 0.0]))
         tilt = np.arctan2(np.hypot(*found.axis[:2]), abs(found.axis[2]))
         angle.append(float(np.degrees(tilt)))
-        told += found.sd == inf
+        told += found.rms_error == inf
     return [
         Result("direction, RMS", float(np.sqrt(np.mean(np.square(angle)))), 0.4),
         *median_and_worst("direction", angle),
@@ -172,7 +172,7 @@ def hinge_axis(_: Path) -> list[Result]:
 
 
 def parent_covariance(_: Path) -> list[Result]:
-    """Compare the predicted covariance of a point in a noisy frame with 20 000 frames."""
+    """Compare the predicted covariance of a point in a noisy frame with 20 000 simulated frames."""
     rng = np.random.default_rng(12)
     point, noise = CHILD[1], 1e-3
     turns = np.tile(np.eye(3), (20_000, 1, 1))

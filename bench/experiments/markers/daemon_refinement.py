@@ -39,7 +39,7 @@ COSTS_NOTHING_DEG = 0.1
 
 
 def refined(_: Path) -> list[Result]:
-    """Change of live errors by refinement, deg; a negative value is an improvement."""
+    """Measure the change of live errors by refinement, deg; a negative change is an improvement."""
     rig = bench_rig()
     worn: list[Array] = []
     knocked: list[Array] = []

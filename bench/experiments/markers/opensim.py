@@ -1,7 +1,6 @@
 """Refined markers, evaluated by the inverse kinematics of OpenSim.
 
-Only the marker positions of the models are changed. Trials that are called unseen were used neither
-for learning nor for any choice.
+Only the marker positions of the models are changed.
 """
 
 from __future__ import annotations

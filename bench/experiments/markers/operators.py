@@ -95,7 +95,7 @@ def team(
 
 
 def repeatability(data: Path, teams: int = TEAMS) -> list[Result]:
-    """Measure the median over teams before and after refinement, and the worst ratio."""
+    """Measure the median over teams before and after refinement, and the worst relative change."""
     model, truly = oc4_lower(data), _movements(data)
     settings = RefinementSettings()
     found = [team(model, truly, seed, settings) for seed in range(teams)]

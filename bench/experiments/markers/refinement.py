@@ -117,7 +117,7 @@ def misplaced(data: Path) -> ChainModel:
 
 
 def beside_search(data: Path, every: int = 1) -> list[Result]:
-    """Compare the published coordinate search with the simultaneous method, displaced start."""
+    """Compare the published coordinate search with the simultaneous method on misplaced markers."""
     model, trials = misplaced(data), [motion(data, "walking1", every)]
     validation = [motion(data, "STS1")]
     began = time.process_time()

@@ -27,7 +27,7 @@ FAST = raw_imu_trials.TRIALS[1]
 STARTS = 20
 SECOND = round(1e9 / raw_imu_trials.PERIOD_NS)
 SETTLED_GOAL_DEG = 4.0
-"""Largest error at the first output, deg. Later, the fast trial has an error of 2.8 deg."""
+"""Largest RMS error of the first second with output, deg. Later, the RMS error is 2.8 deg."""
 ROUNDING_DEG = 1e-6
 """Largest difference due to rounding, deg."""
 

@@ -156,7 +156,7 @@ def turned_sensor(
 def orientation_error(
     q: Array, readings: list[SensorReading], calibration: SensorCalibrationSettings | None
 ) -> tuple[float, float]:
-    """Return the RMS errors after 10 s, deg, of the whole orientation and of its vertical."""
+    """Return the RMS errors of the orientation and of the inclination after 10 s, deg."""
     correction = None if calibration is None else SensorCorrection(calibration)
     samples = RawSamples(RATE_HZ, magnetometer=True, correction=correction)
     found = [
@@ -176,7 +176,7 @@ def orientation_error(
 
 
 def before_and_after(_: Path) -> list[Result]:
-    """Measure the median and largest RMS errors of the sensors, and gyroscope scale errors."""
+    """Measure median and largest RMS error of the sensors, and scale errors of the gyroscopes."""
     errors, scales = [], []
     for seed in range(SENSORS):
         rng = np.random.default_rng(seed)

@@ -35,7 +35,7 @@ def _rms(values: list[float]) -> float:
 
 
 def stillness(data: Path) -> list[Result]:
-    """Measure the share of detected rest, and of motion detected as rest, in two board trials."""
+    """Measure the shares of rest and of motion that are detected as rest, in two board trials."""
     h5py = import_module("h5py")  # imported by this experiment only
     figures = []
     for name in TRIALS:

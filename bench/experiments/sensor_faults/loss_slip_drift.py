@@ -1,9 +1,9 @@
 """Sensors that are lost, stick, slip or drift, on simulated subjects.
 
-The subjects have the settings of the demo: 5 degrees of common soft-tissue artefact, 3 degrees of
-each sensor, filter errors of the sensors, and random alignments and headings. A jump is the
-difference between the output with the fault and the output of the same subject without it. The unit
-of a jump is the predicted RMS error of the same frame.
+The subjects have the settings of the demo: 5 degrees of soft-tissue artefact that is common to the
+sensors of a segment, 3 degrees of artefact of each sensor, filter errors of the sensors, and random
+alignments and headings. A jump is the difference between the output with the fault and the output
+of the same subject without the fault, divided by the predicted RMS error of the same frame.
 """
 
 from __future__ import annotations

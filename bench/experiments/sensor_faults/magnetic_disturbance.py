@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import LimbState
 
 PEOPLE = (*SEEDS, 11, 12, 13, 14)
-"""Seeds of the subjects. The limits were chosen without the last four subjects."""
+"""Seeds of the subjects. The limits of the detector were chosen without the last four subjects."""
 MAGNET_S, FIRST_S, APART_S = 80.0, 12.3, 2.9
 LEAST_DEG, MOST_DEG = 20.0, 40.0
 PASSED_DEG = 10.0

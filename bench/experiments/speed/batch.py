@@ -1,4 +1,4 @@
-"""Batch of recordings: time with two processes and with one, memory, and growth with the number."""
+"""Batch of recordings: time with one and two processes, memory, growth with the recordings."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 SAMPLES = 5000
-"""Number of samples of each sensor in a recording for the speed, 50 s. The processing is long
-compared with the start of a process."""
+"""Number of samples of each sensor in a recording of the speed measurement: 50 s."""
 COUNT, ROUNDS = 16, 2
 """Number of recordings per round, and number of alternating rounds."""
 SIZES, QUICK_SIZES = (1, 3, 10, 30, 100, 300, 1000), (1, 2, 4, 8)
-"""Numbers of short recordings for the growth, in about equal ratios."""
+"""Numbers of short recordings in the growth measurement. The ratio of successive numbers is about
+the same."""
 MANY, WARM = 1000, 50
-"""Number of short recordings for the memory, and number of recordings after which all libraries are
-loaded."""
+"""Number of short recordings in the memory measurement, and number of recordings after which all
+libraries are loaded."""
 
 
 def batch_results(quick: bool) -> list[Result]:
@@ -51,7 +51,7 @@ def batch_results(quick: bool) -> list[Result]:
 
         before_mb, after_mb = _memory(_copies(folder / "short", many), folder / "many", warm)
     note = f"{count} recordings of {SAMPLES / 100:.0f} s: replay, export, report; {rounds} rounds"
-    # The start of the two processes takes as long as a recording or longer.
+    # With few recordings, the start of the two processes is a large part of the time.
     least = 1.2 if quick else 1.8
     return [
         Result(
@@ -95,7 +95,7 @@ def recording_growth_results(quick: bool) -> list[Result]:
 
 
 def _batch_loops(trials: Path, out: Path) -> float:
-    """Return the CPU time of a batch with reports in this process, in times of the fixed loop."""
+    """Return the CPU time of a batch with reports in this process, in units of the fixed loop."""
     out.mkdir()
     loop, began = loop_s(), time.process_time()
     tasks = find_recordings(trials, out, ("report",), ())

@@ -94,7 +94,7 @@ def _frames(names: tuple[str, ...], points: Array) -> list[MocapFrame]:
 
 
 def _faulty(points: Array) -> Iterator[tuple[str, Array]]:
-    """Yield the name of each fault, and the faulty markers; no frame may become slow."""
+    """Yield the name of each fault, and the faulty markers."""
     kinds: dict[str, Callable[[Array], Array]] = {
         "two labels of a segment exchanged": lambda p: p[:, [1, 0, *range(2, p.shape[1])]],
         "all labels exchanged": lambda p: p[:, ::-1],

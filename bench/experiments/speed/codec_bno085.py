@@ -1,4 +1,4 @@
-"""BNO085: codecs and decoders per sample, compared with Adafruit's packages."""
+"""BNO085: CPU time of codecs and decoders per sample, compared with Adafruit's packages."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def _rvc_peer() -> Callable[[], object]:
 
 
 def _shtp_peer() -> Callable[[], object]:
-    """Return a function that reads the same packets with the package, without sensor start."""
+    """Return a function that reads the same packets with the package; no sensor is initialized."""
     base: Any = _package("adafruit_bno08x.uart").BNO08X_UART
     reader = type("Reader", (base,), {"initialize": lambda _: None})(_Wire(PACKETS))
 

@@ -1,4 +1,4 @@
-"""LPMS: codecs and decoders per message, on CAN compared with cantools.
+"""LPMS: CPU time of codecs and decoders per message, compared with cantools on CAN.
 
 No Python package reads LP-BUS, so its codec has no comparison. In the same run, cantools decodes a
 CAN frame from a table of the same four signals.

@@ -1,7 +1,7 @@
-"""LSL markers: codec and decoder per sample, compared with pylsl on the same stream.
+"""LSL markers: CPU time of codec and decoder per sample, compared with pylsl on the same stream.
 
-pylsl receives the samples of a simulated program over the network of this host. Only the CPU time
-of the thread that takes the samples counts, not that of the receiving threads of liblsl.
+pylsl receives the samples of a simulated program over the network of this host. The CPU time of the
+thread that takes the samples counts, the CPU time of the receiving threads of liblsl does not.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""NatNet: codec and decoder per frame, and the package `natnet` in the same run."""
+"""NatNet: CPU time of codec and decoder per frame, compared with the package `natnet`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""QTM and Vicon: codec and decoder per frame, and the vendor's package `qtm-rt` in the same run."""
+"""QTM and Vicon: CPU time of codec and decoder per frame; QTM is compared with `qtm-rt`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Devices with table-described messages: codecs and decoders per message, and cantools on CAN.
+"""Messages described by tables: CPU time of codecs and decoders, compared with cantools on CAN.
 
 The CAN frame has four 16-bit integers. In the same run, cantools decodes the same frame from the
 table of a DBC file.

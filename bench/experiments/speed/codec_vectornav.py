@@ -1,7 +1,7 @@
-"""VectorNav: codec and decoder per output.
+"""VectorNav: CPU time of codec and decoder per output.
 
-No package on PyPI reads binary outputs. The package `vectornav-vn200` requests single registers as
-text.
+No package on PyPI reads binary outputs, so there is no comparison. The package `vectornav-vn200`
+requests single registers as text.
 """
 
 from __future__ import annotations

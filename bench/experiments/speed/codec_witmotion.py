@@ -1,4 +1,4 @@
-"""WitMotion: codec and decoder per frame, compared with the package `witmotion`."""
+"""WitMotion: CPU time of codec and decoder per frame, compared with the package `witmotion`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""x-IMU3: codec and decoder per message, compared with the vendor's package."""
+"""x-IMU3: CPU time of codec and decoder per message, compared with the vendor's package."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Parts of the frame's path: compiled modules compared with their sources, in alternating runs.
+"""CPU time of a frame in each part of the daemon: compiled modules compared with their sources.
 
 Two processes run on the same tree, one of them with ``JOINTFIT_PURE=1``. They measure each part in
 turn, so the load of a shared machine affects both equally.

@@ -89,7 +89,7 @@ def _inputs(seconds: float) -> list[dict[str, Quaternion]]:
 
 
 def _plainly(frames: list[dict[str, Quaternion]]) -> Callable[[], object]:
-    """Apply only the array form of the corrections, to one frame at a time."""
+    """Return a function that applies the array form of the corrections to one frame at a time."""
     segments = list(worn().segment.values())
     pairs = (("S1", "S2"), ("S3", "S4"))
     models = [segments[i].models[f"{'+'.join(pairs[i])}|{'+'.join(pairs[1 - i])}"] for i in (0, 1)]
@@ -168,7 +168,7 @@ def frame_times(rate_hz: float, seconds: float) -> list[float]:
     for event in stream:
         began = time.thread_time()
         outputs = core.feed(event)
-        deadline = core.next_deadline_ns  # the runner requests it after every event
+        deadline = core.next_deadline_ns  # the runner reads the deadline after every event
         spent += time.thread_time() - began
         states = [o for o in outputs if isinstance(o, LimbState)]
         if states:

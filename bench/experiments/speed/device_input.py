@@ -72,7 +72,7 @@ class _Line:
         return (time.thread_time() - began - self._writing_s) / len(self._messages)
 
     def take(self) -> None:
-        """Note that a message was received."""
+        """Record that a message was received."""
         if self._left:
             self._send()
         elif self._done is not None and not self._done.done():

@@ -1,4 +1,4 @@
-"""Daemon from serial port to subscriber: latency, CPU share, memory, start, unaccounted samples."""
+"""Daemon from serial port to subscriber: latency, CPU share, memory, start, lost samples."""
 
 from __future__ import annotations
 
@@ -92,9 +92,12 @@ def _cost(name: str, found: Figures, goal_percent: float | None) -> list[Result]
     ]
 
 
-def _honest(name: str, found: Figures) -> Result:
+def _losses(name: str, found: Figures) -> list[Result]:
     note = f"of {found.received}"
-    return timed_result(f"{name}: samples unaccounted for", found.unaccounted, "", 0, 0, note=note)
+    return [
+        timed_result(f"{name}: samples unaccounted for", found.unaccounted, "", 0, 0, note=note),
+        timed_result(f"{name}: samples dropped", found.dropped, "", 0, note=note),
+    ]
 
 
 def _through(rate_hz: float, goal_percent: float | None) -> Callable[[bool], list[Result]]:
@@ -107,7 +110,7 @@ def _through(rate_hz: float, goal_percent: float | None) -> Callable[[bool], lis
         return [
             *_latency(name, found.latencies_ms, 20.0),
             *_cost(name, found, goal_percent),
-            _honest(name, found),
+            *_losses(name, found),
             *(_start(found) if rate_hz == 100.0 else []),
         ]
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 ROUNDS, QUICK_ROUNDS = 4, 1
 ROUND_S, ADAPT_S = 6.0, 0.5
-"""Duration of a measurement, and the time between a change of the priority and it, s."""
+"""Duration of a measurement, and time from a change of the priority to the measurement, s."""
 LOAD = Load(100.0)
 PROGRAMS_PER_CORE = 2
 LONGEST_S = 60.0

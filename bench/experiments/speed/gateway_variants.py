@@ -66,7 +66,7 @@ def _rows_of(title: str, runs: list[Figures], target: float | None) -> list[Resu
     ratios = [one.cpu_s / max(1, len(one.latencies_ms)) / one.loop_s for one in runs]
     frame_us = 1e6 * sum(one.cpu_s for one in runs) / frames
     note = f"{frame_us:.0f} µs per frame; {min(shares):.1f} to {max(shares):.1f}"
-    unaccounted = sum(one.unaccounted for one in runs)
+    unaccounted, dropped = sum(one.unaccounted for one in runs), sum(one.dropped for one in runs)
     return [
         timed_result(
             f"{title}: CPU of the daemon", round(statistics.median(shares), 1), "% of a core",
@@ -77,6 +77,7 @@ def _rows_of(title: str, runs: list[Figures], target: float | None) -> list[Resu
             f"{title}: memory of the daemon", round(max(one.rss_mb for one in runs), 1), "MB", 70
         ),
         timed_result(f"{title}: samples unaccounted for", unaccounted, "", 0, 0),
+        timed_result(f"{title}: samples dropped", dropped, "", 0),
     ]  # fmt: skip
 
 

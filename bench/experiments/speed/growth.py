@@ -72,7 +72,7 @@ class LoadedCore:
             began = time.thread_time()
             for event in events:
                 outputs = core.feed(event)
-                _ = core.next_deadline_ns  # the runner requests it after every event
+                _ = core.next_deadline_ns  # the runner reads the deadline after every event
                 states += sum(isinstance(output, LimbState) for output in outputs)
             spent += time.thread_time() - began
         assert abs(states - count) <= 3, f"{states} limb states of {count} frames"

@@ -1,4 +1,4 @@
-"""Interpreted instructions of each part of the frame's path, independent of machine load.
+"""Interpreted instructions of a frame in each part of the daemon, independent of machine load.
 
 Only bytecode instructions in functions of the project (pure Python) count. The counts are equal on
 every machine and at any load. They do not include work in NumPy or other C code, which the times

@@ -1,4 +1,4 @@
-"""Poses from markers: all frames at once, and one after another with covariance."""
+"""CPU time of poses from markers: all frames at once, and one after another with covariance."""
 
 from __future__ import annotations
 

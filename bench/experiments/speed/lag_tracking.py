@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     Event = tuple[int, str, Quaternion | MocapFrame]
 
 FRAMES = 120 * 14
-"""Number of frames in one window of 10 s and the following hop, for each of four sensors."""
+"""Number of camera frames: 14 s, which contain a window of 10 s and the shift to the next window.
+"""
 
 
 def _events() -> list[Event]:
@@ -46,7 +47,7 @@ def _events() -> list[Event]:
 
 
 def _play(watch: LagMonitor, events: list[Event]) -> tuple[float, float, float]:
-    """Return three CPU times, s: per sample, of the steps per second, and of the longest step."""
+    """Return CPU times, s: per sample, of all steps for 1 s of data, and of the longest step."""
     adding, steps = 0.0, []
     for t_ns, sensor, said in events:
         if isinstance(said, MocapFrame):

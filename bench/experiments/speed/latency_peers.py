@@ -1,4 +1,4 @@
-"""Latency of poses against that of programs that only send: aiomqtt, and the Lab Streaming Layer.
+"""Latency of poses, compared with programs that only send: aiomqtt, and the Lab Streaming Layer.
 
 While the daemon runs, its poses and the messages of both senders are received in turn in the same
 process, so all are delayed by the same other work.

@@ -1,4 +1,4 @@
-"""Machine instructions of a frame on x86-64 and arm64, and what they mean for a Raspberry Pi.
+"""Machine instructions of a frame on x86-64 and arm64, and estimated CPU share of a Raspberry Pi.
 
 QEMU's user emulation counts instructions; it does not measure time. The CPU time of another
 processor is estimated from its clock rate and an assumed number of instructions per cycle. No

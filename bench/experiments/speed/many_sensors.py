@@ -1,4 +1,4 @@
-"""Running daemon with many sensors, and with fast ones: every sample must be received and used."""
+"""Running daemon with many sensors or fast sensors: every sample must be received and used."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def write_rig(folder: Path, port: int, sensors: Sensors) -> Path:
 async def measure(
     folder: Path, port: int, sensors: Sensors, seconds: float, *, compiled: bool
 ) -> Figures:
-    """Run sensors and daemon; return what was measured in `seconds`."""
+    """Run sensors and daemon for `seconds`; return the results."""
     path = write_rig(folder, port, sensors)
     rig = load_rig(path)
     names = set(sensor_names(sensors.number))
@@ -153,7 +153,7 @@ async def measure(
 
 
 def rows(quick: bool) -> list[Result]:
-    """Return losses, CPU share, memory and latency of each rig, on the sources and compiled."""
+    """Return losses, CPU share, memory and latency of each rig, with and without compilation."""
     if (reason := MosquittoBroker.missing()) is not None:
         print(f"not run: {reason}", file=sys.stderr)
         return []

@@ -30,7 +30,7 @@ CASES = (((80, 24), 5.0), ((80, 24), 10.0), ((40, 20), 5.0), ((120, 40), 5.0))
 """Measured cases: columns and rows of the terminal, and value of ``--rate``."""
 ROUNDS, SECONDS, QUICK_S = 3, 6.0, 2.0
 WARM_UP_S = 12.0
-"""Time until the curve is full, s. It is not part of the measurement."""
+"""Time until the plotted curve has its full length, s. It is not part of the measurement."""
 START_S = 40.0
 PAUSE_S = 0.025
 """Longest pause within an update, s. A large update arrives in several parts.

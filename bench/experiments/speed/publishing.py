@@ -1,4 +1,4 @@
-"""CPU time to publish a pose: the daemon's connection, a minimal aiomqtt publisher, a socket.
+"""CPU time to publish a pose by the daemon's connection, a minimal aiomqtt publisher, a socket.
 
 The broker is a thread that accepts connections and discards the received data. Only the CPU time of
 the publishing thread counts. As with poses, a message is sent after the previous message was

@@ -26,7 +26,7 @@ CHECKING = "import jointfit_daemon.__main__, jointfit_daemon.config"
 
 
 def _imported(code: str, count: int) -> float:
-    """Return the median time of a Python process with `code`, less an empty process, s."""
+    """Return the median time of a Python process with `code` minus that of an empty process, s."""
     took = {code: [], "pass": []}  # type: dict[str, list[float]]
     for _ in range(count):
         for each, times in took.items():

@@ -84,7 +84,7 @@ class _Gateway:
         began = time.thread_time()
         for event in batch:
             outputs = core.feed(event)
-            _ = core.next_deadline_ns  # the runner requests it after every event
+            _ = core.next_deadline_ns  # the runner reads the deadline after every event
             for output in outputs:
                 if isinstance(output, LimbState):
                     encode_pose(output, UNIX_NS, output.completed_ns)
@@ -122,7 +122,7 @@ def _instant(event: Event) -> int:
 
 
 def rows(quick: bool) -> list[Result]:
-    """Return the CPU time per second of data for each setting, and its ratio to the first."""
+    """Return the CPU time per second of data, and its ratio to the first setting, by setting."""
     rounds = QUICK_ROUNDS if quick else ROUNDS
     gateways = {setting: _Gateway(setting, SETTLE_S + rounds) for setting in SETTINGS}
     for gateway in gateways.values():

@@ -104,9 +104,10 @@ def _rms(values: NDArray[np.float64]) -> float:
 
 
 def echoes(_: Path, runs: int = 200) -> list[Result]:
-    """Measure errors with echoes of 0.86 ms, exponential delays of 0.1 ms each way, and spikes.
+    """Measure the errors of a clock that is fitted to echoes.
 
-    1 % of the echoes have spikes of 20 ms.
+    In each direction, an echo has a delay of 0.43 ms, plus an exponential delay with a mean of
+    0.1 ms, plus, in 1 % of the cases, 20 ms.
     """
     first, last, skew = np.array([echo_run(seed) for seed in range(runs)]).T
     return [

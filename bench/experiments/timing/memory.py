@@ -2,8 +2,8 @@
 
 The complete core processes four IMUs on UART and CAN, and cameras with one echo per second. In
 every hour, one sensor reboots and another is silent for a minute, in turn. All devices run at 5 Hz,
-so ten hours are 900 000 samples instead of 19 million. Buffers with a time limit (windows,
-histograms, buckets, echoes) fill as at any rate. Buffers with a number limit are full within
+so ten hours have 900 000 samples instead of 19 million. Buffers with a time limit (windows,
+histograms, buckets, echoes) fill as at full rates. Buffers with a number limit are full within
 minutes.
 """
 
@@ -170,7 +170,7 @@ def watch(hours: float, looks_an_hour: int) -> tuple[list[Held], int, int]:
         for event in events:
             states += sum(isinstance(output, LimbState) for output in core.feed(event))
         if minute % every == 0:
-            core.health(events[-1].chunk.t_ns)  # as the daemon requests it
+            core.health(events[-1].chunk.t_ns)  # as in the daemon
             looks.append(held(core, minute / 60))
         if minute >= 60 * hours:
             return looks, samples, states
