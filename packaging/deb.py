@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
 """Build the Debian package: `python packaging/deb.py [--arch amd64|arm64] [--out DIR]`.
 
-Invariant: the content depends only on ``requirements.lock``, the commit, and the versions of Python
-and C compiler of this machine. The same commit yields identical bytes. All dates are
-SOURCE_DATE_EPOCH, by default the time of the commit. Wheels are only unpacked, so a package for
-another architecture can also be built. Only a package for the architecture of this machine contains
-compiled modules (packaging/compiled.py), if a C compiler exists.
+Invariant: the content depends only on ``requirements.lock``, the commit, and the Python, C compiler
+and ``strip`` of this machine (their versions, and whether the last two are installed). The same
+commit yields identical bytes. All dates are SOURCE_DATE_EPOCH, by default the time of the commit.
+Wheels are only unpacked, so a package for another architecture can also be built. Only a package
+for the architecture of this machine contains compiled modules (packaging/compiled.py), if a C
+compiler exists.
 
 The package contains its own site-packages, for all Python versions in `PYTHONS`: the names of
 extension modules contain the Python version, and all other files are the same for all versions. Its

@@ -93,7 +93,7 @@ def page_parts(text: str) -> Iterator[Block | PageFile]:
 
 
 def uncommanded(text: str) -> list[str]:
-    """Return the fences of a page without a language, and outputs without commands."""
+    """Return the contents of all fences that have no language or the language ``text``."""
     return [fence[3] for fence in FENCE.finditer(text) if fence[2] in {"", "text"}]
 
 
@@ -181,7 +181,7 @@ class Shell:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Kill the remaining services and bash."""
+        """Kill the remaining services, close the input of bash, and wait until bash ends."""
         for _, pid, _ in self._services:
             self._ask(f"kill -KILL {pid}; echo")
         self._process.communicate(timeout=COMMAND_S)
@@ -224,7 +224,7 @@ class Shell:
         return files
 
     def _ask(self, script: str) -> str:
-        """Send a script that prints one line to bash; return the line."""
+        """Send bash a script that prints one line; return this line."""
         stdin, stdout = self._process.stdin, self._process.stdout
         assert stdin is not None
         assert stdout is not None

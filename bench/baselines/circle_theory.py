@@ -1,4 +1,4 @@
-"""Theory of circle centers for experiments and tests: bounds, and errors of centers of 3 frames.
+"""Theory of circle centers for experiments and tests: bounds, and errors of centers from 3 frames.
 
 A bound depends on the movement and the noise only. It is infinite if the movement contains no
 information about the center.

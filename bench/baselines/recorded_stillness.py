@@ -109,7 +109,7 @@ def still_from_orientation(
 
 
 def _step_means(q: NDArray[np.float64], step: int) -> NDArray[np.float64]:
-    """Return the normalized mean of every `step` successive rows, `step` - 1 rows fewer."""
+    """Return the normalized means of `step` successive rows, which are `step` - 1 rows fewer."""
     count = max(0, len(q) - step + 1)
     total = np.zeros((count, 4))
     for offset in range(step):

@@ -56,8 +56,8 @@ SENSORS = {
 """Three markers for each sensor. The left shank has only three markers, so its two sensors share
 them."""
 MEDIAL = ("r_mknee", "r_mankle", "L_mknee", "L_mankle")
-"""Markers that only the static trial contains. They are not tracked, because the bones of the
-static trial would then differ from the bones of other trials.
+"""Markers that only the static trial contains. They are not tracked: if they were, the bones of
+the static trial would differ from the bones of the other trials.
 """
 
 
@@ -66,7 +66,10 @@ AS_RECORDED = (0, 1, 2, 3)
 
 
 class _Leg(NamedTuple):
-    """Orientations of one leg without alignment and filter errors, shape (n, 4) each."""
+    """Orientations of one leg, shape (n, 4) each, and their times, shape (n,).
+
+    `skin_knee` aligns the sensors to the bones and adds the filter errors.
+    """
 
     skin: tuple[Array, ...]
     """Rotation of each sensor's markers since the static trial."""

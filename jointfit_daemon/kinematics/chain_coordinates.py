@@ -6,7 +6,9 @@ rotation matrix A by a function f(q). This module inverts f by Gauss-Newton step
 .. math:: q \leftarrow q + G^{+}\,\log(f(q)^{-1} A), \qquad G = \partial\log / \partial q
 
 :math:`G^{+}` is the pseudo-inverse of G. The covariance of the coordinates is
-:math:`G^{+} C G^{+T}`, where C is the covariance of the rotation vector in the step.
+:math:`G^{+} C G^{+T}`, where C is the covariance of the joint in a step of the chain
+state (`chains.apply_step`). A step contains the rotation vector by which A is rotated, in the axes
+of the segment, and the translation of a free joint.
 """
 
 from __future__ import annotations

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 
 
 TRUNK_JOINTS = ("trunk", "spine", "lumb", "neck", "cervic")
-"""Parts of the names of trunk joints, whose upper segment is the proximal segment of the chain."""
+"""Parts of the names of trunk joints. A trunk is listed from the top, so the proximal segment of
+such a joint is the upper one."""
 SHOULDER_JOINTS = ("shoulder", "glenohumeral", "humerothoracic", "thoracohumeral")
 """Parts of the names of joints with the angles plane of elevation, elevation and rotation."""
 FLEXES_FORWARD = ("hip", "ankle", "elbow", "wrist", *SHOULDER_JOINTS, *TRUNK_JOINTS)

@@ -53,7 +53,10 @@ class HostState:
 
 
 def read_host(folder: Path) -> HostState:
-    """Return the state of the host. `folder` contains the calibrations. Call it in a thread."""
+    """Return the state of the host; call this function in a thread.
+
+    `folder` is the folder of the calibrations.
+    """
     fault, free = write_fault(folder), None
     for place in (folder, *folder.absolute().parents):
         if place.is_dir():
@@ -113,7 +116,10 @@ def _device(source: Source, device: DeviceHealth) -> Finding:
             "cause",
         )  # fmt: skip
     if device.sensor == "stuck":
-        remedy = f'restart it: power, or the request restart-device {{"device":"{name}"}}'
+        remedy = (
+            "restart the device: switch its power off and on, or send the request restart-device "
+            f'{{"device":"{name}"}}'
+        )
         return Finding("device", name, "error", "repeats its value while others move", remedy)
 
     bad = wire.lost + wire.corrupt
@@ -145,7 +151,7 @@ def _clock(source: Source, device: DeviceHealth) -> Finding:
         remedy = "check the network to the server: round trips stopped"
         return Finding("clock", name, "warning", text, remedy)
     if clock.sigma_ns is not None and clock.sigma_ns > CLOCK_SIGMA_NS:
-        remedy = "connect it without a hub, or use a synchronization line (docs: Time)"
+        remedy = "connect the device without a hub, or use a synchronization line (docs: Time)"
         return Finding("clock", name, "warning", text, remedy)
     return Finding("clock", name, "ok", text)
 
@@ -167,13 +173,16 @@ def _calibration(rig: Rig, health: BridgeHealth) -> Iterator[Finding]:
     for name, lag in core.lags.items():
         if lag.source == "none":
             yield Finding(
-                "lag", name, "warning", "lag behind the cameras unknown: 0 is subtracted",
+                "lag", name, "warning",
+                "lag behind the cameras unknown: 0 is subtracted from the stamps",
                 "repeat the functional phase with faster movements, or set lag_ms",
             )  # fmt: skip
         elif not lag.used_ns and lag.found_by in (None, "none") and lag.source == "calibration":
             yield Finding("lag", name, "ok", "no lag determined (assumed 0 ms)")
         elif lag.used_ns is not None:
-            yield Finding("lag", name, "ok", f"lag {lag.used_ns * 1e-6:.1f} ms by {lag.source}")
+            yield Finding(
+                "lag", name, "ok", f"lag {lag.used_ns * 1e-6:.1f} ms, source: {lag.source}"
+            )
 
 
 def _store(host: HostState, health: BridgeHealth) -> Iterator[Finding]:

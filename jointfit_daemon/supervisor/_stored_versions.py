@@ -1,7 +1,7 @@
 """Summaries of the stored calibrations for the request ``calibrations``.
 
-The file is read without the checks that are necessary before a calibration is used. A list of
-summaries therefore takes only milliseconds.
+The file of each calibration is read without the checks that are necessary before the calibration
+is used. A list of summaries therefore takes only milliseconds.
 """
 
 from __future__ import annotations

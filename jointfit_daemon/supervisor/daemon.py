@@ -116,7 +116,7 @@ STOP_S = 4.8
 
 
 class Daemon:
-    """One running rig; a `Sink` of the core for jobs, calibrations and log lines.
+    """One running rig; a `Sink` of the core for jobs, calibrations, replies and device states.
 
     Parameters
     ----------

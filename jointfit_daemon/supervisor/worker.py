@@ -58,7 +58,7 @@ def main() -> int:
 
 
 def _control(answer_fd: int) -> JobControl:
-    """Return an object that measures the duration from now on and reports to a descriptor."""
+    """Return an object that measures the time from now on and reports progress to a descriptor."""
     from jointfit_daemon.calibration import JobControl  # noqa: PLC0415 - as above
 
     began = reported = time.monotonic()

@@ -1,4 +1,4 @@
-"""Fuzz targets of VectorNav: serial bytes, and texts with valid checksums up to events."""
+"""Fuzz targets of VectorNav: the codec with any bytes, the decoder with valid checksums."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def run_vectornav_bytes(data: bytes) -> None:
 
 
 def run_vectornav_decoder(data: bytes) -> None:
-    """Put records into texts and device times, and decode them."""
+    """Decode binary outputs and texts whose device times and contents come from `data`."""
     decoder = VectorNavImu(settings()).decoder()
     for number, (kind, content) in enumerate(records(data)):
         t_ns = number * PERIOD_NS
@@ -36,7 +36,7 @@ def run_vectornav_decoder(data: bytes) -> None:
 
 
 def seeds_vectornav() -> list[bytes]:
-    """Return binary outputs among texts."""
+    """Return binary outputs that alternate with texts."""
     text = encode_text("VNYMR,+100.949,-007.330,+000.715")
     return [b"".join(output(n * PERIOD_NS) + text for n in range(count)) for count in (1, 5)]
 

@@ -1,6 +1,6 @@
-"""A recorded run with a static calibration, a mark, a reconnection and a reload, within a second.
+"""A recorded run with a static calibration, a mark, a reconnection and a reload.
 
-The bytes of four sensors arrive at simulated times, so no test waits for them.
+The bytes of four sensors arrive at simulated times, so the run takes less than a second.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class RecordingBench(Bench):
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """The files of the run and what the live run produced."""
+    """The files of a recording, and results of the live run."""
 
     path: Path
     calibration: Calibration

@@ -89,7 +89,7 @@ def test_output_that_only_the_replay_has_is_a_difference(
 def test_outputs_after_a_gap_are_not_compared(
     run: RecordedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_recorder, "PENDING_BYTES", 1_500_000)  # of a slow disk
+    monkeypatch.setattr(_recorder, "PENDING_BYTES", 1_500_000)  # as if the disk were slow
     record_run(tmp_path)
     found = verify_recording(tmp_path)
     assert found.passed

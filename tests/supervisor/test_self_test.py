@@ -18,10 +18,14 @@ if TYPE_CHECKING:
 @pytest.mark.parametrize(
     ("lag", "level", "text"),
     [
-        (("none", None, None), "warning", "lag behind the cameras unknown: 0 is subtracted"),
+        (
+            ("none", None, None),
+            "warning",
+            "lag behind the cameras unknown: 0 is subtracted from the stamps",
+        ),
         (("calibration", 0.0, "none"), "ok", "no lag determined (assumed 0 ms)"),
-        (("calibration", 4_200_000.0, "plate"), "ok", "lag 4.2 ms by calibration"),
-        (("configured", 0.0, None), "ok", "lag 0.0 ms by configured"),
+        (("calibration", 4_200_000.0, "plate"), "ok", "lag 4.2 ms, source: calibration"),
+        (("configured", 0.0, None), "ok", "lag 0.0 ms, source: configured"),
     ],
 )
 def test_the_lag_of_a_sensor_is_reported_with_its_origin(

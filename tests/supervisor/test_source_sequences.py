@@ -158,7 +158,10 @@ class Supervised(RuleBasedStateMachine):
 
     @rule()
     def change_during_a_restart(self) -> None:
-        """Lose every device while its port closes."""
+        """Lose all devices, and repair the first one 0.1 s later.
+
+        Its port then closes, or its source waits for the retry.
+        """
         for name in NAMES:
             self.ports[name].mood = "lost"
         self.pass_time(0.1)
@@ -191,7 +194,7 @@ class Supervised(RuleBasedStateMachine):
 
 @pytest.fixture(autouse=True)
 def no_real_devices(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Disable the waiting for device files, because the sources of these tests have no port."""
+    """Disable the waiting for device files, because the ports of these tests have none."""
     path = "jointfit_daemon.supervisor._source_tasks.device_path"
     monkeypatch.setattr(path, lambda _: None)
 

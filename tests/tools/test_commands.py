@@ -61,7 +61,7 @@ def test_every_command_with_a_result_prints_it_as_json_on_request(command: str) 
 
 
 def completions(*words: str) -> list[str]:
-    """Return what bash offers after Tab at the end of the words."""
+    """Return the completions that bash offers if Tab follows the words."""
     line = " ".join(map(shlex.quote, ("jointfit", *words)))
     script = f"""
         . {COMPLETION}

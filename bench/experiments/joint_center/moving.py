@@ -47,7 +47,7 @@ MEMORY_S = 10.0
 MOVED_AT_S = 15.0
 CAMERAS_HZ = 40.0
 RIGID, WORN = 0.0, 5.0
-"""RMS soft-tissue artefact of the markers, mm: without artefact, and on a subject."""
+"""RMS soft-tissue artefact of the markers, mm: on the bones, and on the skin."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,8 @@
 
 Simulated subjects are calibrated with and without `refine_markers`. For some subjects, one marker
 of each segment is displaced between static pose and movement. Live errors are compared for each
-subject. The optical reference affects the comparison only through the calibrations.
+subject. They refer to the simulated bones, so the cameras affect them only through the
+calibrations.
 """
 
 from __future__ import annotations
@@ -81,7 +82,10 @@ def refined(_: Path) -> list[Result]:
 def _change(
     rig: Rig, pose: StaticPose, functional: CalibrationTrial, alignment: PlateAlignment, live: Live
 ) -> tuple[Array, Calibration]:
-    """Return the change of the errors of knee, thigh and shank by refinement, deg."""
+    """Return the change of the errors of knee, thigh and shank by refinement, deg.
+
+    The second result is the calibration with refinement.
+    """
     found = [
         fit_calibration(
             pose, functional, alignment, replace(rig.calibration, refine_markers=on), rig.chain

@@ -209,12 +209,13 @@ def chosen_evenness(subject: OpensimSubject, trained: Sequence[str]) -> float:
 _OPENSIM = ("opensim",)
 UNTRAINED = (
     "the marker positions were refined on walking, which does not contain the soft-tissue "
-    "artefact of sit-to-stand; a smaller prior improves walking and impairs the other "
-    "movements"
+    "artefact of sit-to-stand; a smaller weight λ of the prior improves walking and impairs "
+    "the other movements"
 )
 PRIOR = (
-    "a smaller prior meets the threshold but impairs the untrained movements, so the "
-    "default prior was not changed; in addition, OpenSim's tool at its default accuracy "
+    "a smaller weight λ of the [prior](markers.md#objective) meets the threshold but impairs the "
+    "untrained movements, so the default was not changed; in addition, OpenSim's tool at its "
+    "default accuracy "
     "stops before the minimum of the error"
 )
 EXPERIMENTS = (

@@ -323,8 +323,8 @@ FREE_FEET = (
     "value"
 )
 THREE_TRIALS = (
-    "the variance of one subject is that of three nearly equal errors, so its relative change is "
-    "mostly chance; the error of every subject is reduced by more than half"
+    "the variance of one subject is computed from three nearly equal errors, so its relative "
+    "change is mostly chance; the error of every subject is reduced by more than half"
 )
 EXPERIMENTS = (
     Experiment(

@@ -289,7 +289,7 @@ EXPERIMENTS = (
                 "the alarms occur while the subject sits, in the right leg, with the "
                 "reference from placed markers, in 3 of 8 deals; while the subject sits, the soft "
                 "tissue of thigh and shank rotates by another angle than in squats at the same "
-                "knee flexion, even without filter errors",
+                "knee flexion; this difference also exists in the data without filter errors",
             ),
             (
                 "walking",

@@ -171,7 +171,7 @@ def segment_rows(quick: bool) -> list[Result]:
 def marker_rows(quick: bool) -> list[Result]:
     """Return the growth with the markers of a segment with one sensor.
 
-    The results include the configuration with the most markers.
+    The last result is the time to configure a core with the most markers.
     """
     rows = size_rows("markers", lambda count: GrowingRig(1, 1, count), MARKERS, quick)
     rig = GrowingRig(1, 1, MARKERS[-1])
@@ -183,8 +183,9 @@ def marker_rows(quick: bool) -> list[Result]:
 
 
 def run_time_rows(quick: bool) -> list[Result]:
-    """Return the exponents of a frame's time and instructions in the number of earlier frames.
+    """Return the growth of a frame's CPU time and instructions with the number of earlier frames.
 
+    The results are the two exponents of growth, and the instruction counts of the single blocks.
     The time of each block of frames is divided by the time of a fixed loop just before the block,
     so the load of the machine cancels. Each point of the regression is the median of a third of a
     decade. The instructions are counted at the end of this third.

@@ -23,7 +23,7 @@ _READINGS = 5
 
 
 class WallClock:
-    """Converts kernel stamps to the monotonic clock. Call `pair` at every wake-up.
+    """Converts kernel stamps to the monotonic clock. Call `pair` before every read of packets.
 
     Parameters
     ----------

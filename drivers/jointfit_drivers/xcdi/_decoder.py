@@ -238,11 +238,11 @@ def _native(group: XcdiGroup) -> Quaternion:
 
 _NO_TIME = (
     f"{_TIMELESS} quaternions without SampleTime: samples are stamped on arrival; set "
-    "`ids.sample_time`, or switch the output on (over UART, Xsens MT Manager)"
+    "`ids.sample_time`, or switch the output on with Xsens MT Manager over the sensor's UART"
 )
 _OVERFLOWED = "its output buffer overflowed, frames are lost: lower its rate or raise the bit rate"
 _SHARED = (
     "counters and times contradict each other: two sensors use the same CAN identifiers, so "
-    "none of their samples is used: give each sensor identifiers of its own (over UART, Xsens MT "
-    "Manager) and set `ids`"
+    "none of their samples is used: give each sensor identifiers of its own with Xsens MT Manager "
+    "over the sensor's UART, and set `ids`"
 )

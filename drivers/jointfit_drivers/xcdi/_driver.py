@@ -178,7 +178,7 @@ class XcdiImu:
     def __init__(self, settings: XcdiSettings) -> None:
         self._settings = settings
         self._ids = settings.ids.resolve(extended=settings.extended_ids)
-        self._reception = CanReception(settings, "over UART, Xsens MT Manager")
+        self._reception = CanReception(settings, "with Xsens MT Manager over the sensor's UART")
 
     def decoder(self) -> XcdiDecoder:
         """Return the decoder from chunks to samples, for live data and replay."""

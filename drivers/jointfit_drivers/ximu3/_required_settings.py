@@ -22,7 +22,7 @@ _MESSAGE_TYPES = (
     "quaternion", "rotation matrix", "Euler angles", "linear acceleration", "earth acceleration",
 )  # fmt: skip
 _MAGNETIC_DIVISORS = (1, 2)
-"""Divisors of the magnetometer's rate of 20 Hz. With them, it sends at 20 or 10 Hz."""
+"""Divisors of 20 Hz, the rate of the magnetometer. Its data are then sent at 20 or 10 Hz."""
 
 
 class RequiredSetting(NamedTuple):

@@ -77,12 +77,13 @@ def chosen_center(
     start : ndarray, shape (3,)
         Position that is used along unobserved directions, static world, m.
     turned : (ndarray or None, ndarray or None)
-        Rotations q_now_static of both parts from their IMUs, shape (m, 4).
+        Rotations q_now_static of both parts from their IMUs, shape (m, 4); None without an IMU.
 
     Returns
     -------
     CenterEstimate
-        Center in the static world, m, with `leverage`; `refused` contains cause and remedy.
+        Center in the static world, m, with `leverage`. If the center is rejected, `refused`
+        contains cause and remedy.
     """
     if method == "oriented" and turned[1] is None:
         parent, child, turned = child, parent, turned[::-1]

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class MissingPackageError(ImportError):
-    """The optional package for this file format is not installed; the message names it."""
+    """The optional package for this file format is not installed; the message names the package."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class C3dTrial:
 
     trajectories: MarkerTrajectories
     up_axis: str | None
-    """Vertical screen axis "x", "y" or "z"; None if the file declares none."""
+    """Axis that points up on the screen, "x", "y" or "z"; None if the file declares none."""
     events: tuple[C3dEvent, ...] = ()
     """Events in the order of the file."""
     own_texts: Mapping[str, str] = field(default_factory=dict)
@@ -61,7 +61,7 @@ def read_c3d(path: Path) -> C3dTrial:
         ) from missing
     reject_device(path)
     with path.open("rb") as handle, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # c3d warns of every file without analog channels
+        warnings.simplefilter("ignore")  # c3d warns about every file without analog channels
         try:
             return _read(path, c3d.Reader(handle))
         except MalformedFileError:

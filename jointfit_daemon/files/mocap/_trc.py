@@ -78,8 +78,8 @@ def read_trc(path: Path) -> MarkerTrajectories:
     Raises
     ------
     MalformedFileError
-        The file is not TRC, has no markers, two markers of one name, no rows, or an unknown unit of
-        length.
+        The file is not TRC, has no markers, two markers of one name, no rows, invalid numbers, or
+        an unknown unit of length.
     """
     lines = read_lines(path)
     _require_header(path, lines)
@@ -118,7 +118,7 @@ def read_trc(path: Path) -> MarkerTrajectories:
     require_times(path, rows[:, 1])
     if not (np.abs(rows[:, 0]) < _MOST_FRAMES).all():
         raise MalformedFileError(
-            f"{path}: the first column must hold frame numbers: export it again"
+            f"{path}: the first column must hold frame numbers: export the trial again"
         )
     counted = {"NumFrames": len(rows), "NumMarkers": len(names)}
     warnings = tuple(

@@ -171,7 +171,8 @@ def read_xdf_session(path: Path) -> SessionData:
 
     Time stamps are corrected by the clock offsets. In files of other programs, streams of strings
     become events. Channels with the types PositionX to PositionZ become markers, and channels with
-    the types OrientationX to OrientationW become sensors. The first time stamp becomes 0 s.
+    the types OrientationX to OrientationW become sensors. If the file does not contain the start
+    time of the session, the first time stamp becomes 0 s.
 
     Raises
     ------

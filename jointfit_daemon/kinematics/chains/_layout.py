@@ -52,7 +52,10 @@ class ChainLayout:
     shift_twists: Array
     """Twists of the translations in `shifts`, shape (len(shifts), 6)."""
     spread: Array
-    """Matrix that maps a step to the rotation vectors of all segments, shape (nq, 3 S)."""
+    """Matrix, shape (nq, 3 S). ``step @ spread`` contains the rotation vectors by which a step of
+    the state (`apply_step`) rotates each segment relative to its parent. Rows of translations and
+    coupled joints are zero.
+    """
     below: Array
     """Matrix with 1 where segment j is segment i or a descendant of segment i, shape (S, S)."""
     moves: Array

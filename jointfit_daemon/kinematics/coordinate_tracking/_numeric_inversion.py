@@ -56,8 +56,8 @@ _SMALLEST_STEP = 1e-10
 _QUARTERS = (0.0, 0.5 * np.pi, -0.5 * np.pi, np.pi)
 """Start angles of an inversion without values of a preceding instant, rad."""
 _STEEP = 0.87
-"""Start angle of the second of three rotations instead of 90 degrees, where the first and the third
-rotation are about the same axis; rad.
+"""Start angle of the second of three rotations, rad. At 90 degrees, the first and the third
+rotation would be about the same axis.
 """
 _MOST_ANGLES = 3
 
@@ -200,7 +200,8 @@ def _take_step(
     scale = min(1.0, _FARTHEST_STEP / max(turned, _SMALLEST_STEP))
     values = values + np.where(joint.is_angle, scale * step, step)
 
-    # Fewer coordinates than degrees of freedom describe a noisy pose by least squares.
+    # If there are fewer coordinates than degrees of freedom, a noisy pose is fitted by least
+    # squares. The search then ends when the steps are small.
     in_part = len(values) < len(missing) and off < _FARTHEST_MISFIT
     settled = in_part and float(np.abs(step).max(initial=0.0)) < _SETTLED
     return values, G, off < _CLOSE or settled

@@ -78,7 +78,8 @@ def _optical_track(frames: list[tuple[int, MocapFrame]]) -> OpticalTrack:
     body_positions = np.full((n, len(bodies), 3), np.nan)
     body_orientations = np.full((n, len(bodies), 4), np.nan)
     residuals = np.full((n, len(markers)), np.nan)
-    for layout in layouts:  # Copy once per layout; one copy per frame would block the core.
+    # Copy once per layout: a copy per frame would stop the processing of samples for too long.
+    for layout in layouts:
         rows = np.array([row for row, (_, frame) in enumerate(frames) if frame.layout == layout])
         seen = [frame for _, frame in frames if frame.layout == layout]
         to_marker = np.array([markers.index(name) for name in layout.markers], dtype=np.intp)

@@ -69,8 +69,8 @@ class SampleOutcome(StrEnum):
     DROPPED = "dropped"
     """Sample discarded because of overflow, reset, close, or a timestamp in the future."""
     IDLE = "idle"
-    """Motion-capture frame that is not needed outside of a calibration. A stream never has this
-    outcome.
+    """Mocap frame that no calibration phase records, and from which the position of O1 is not
+    computed. A stream never has this outcome.
     """
 
 

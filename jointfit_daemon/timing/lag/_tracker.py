@@ -60,7 +60,7 @@ class LagTracker:
         self._inflate = max(1.0, window_s / hop_s)
         self._t_ns: int | None = None
         self._tau = self._drift = 0.0
-        self._tt = self._pt = self._pp = 0.0  # covariance of (tau, drift), s
+        self._tt = self._pt = self._pp = 0.0  # covariance of (tau, drift): s^2, s, 1
         self._refused: list[float] = []
 
     def feed(self, t_ns: int, estimate: LagEstimate) -> TrackedLag | None:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 CHECK = "serial"
 MOST_LATENCY_MS = 2
-"""Largest acceptable latency timer of an FTDI adapter, ms. A longer delay affects the samples."""
+"""Largest acceptable latency timer of an FTDI adapter, ms. A longer timer delays the samples."""
 _MODEM_PORTS = ("ttyACM", "ttyUSB")
 _DAEMON_NAMES = ("jointfitd", "python")
 _RULES = (
@@ -54,7 +54,7 @@ def _check_port(host: Host, path: str, ports: Sequence[SerialPortInfo]) -> Itera
         listed = ", ".join(port.path for port in ports) or "none"
         yield Finding(
             CHECK, path, "error", f"absent; this host has {listed}",
-            "plug it in, or set its path in rig.toml: ls -l /dev/serial/by-id",
+            "plug it in, or set its path in rig.toml; ls -l /dev/serial/by-id lists the paths",
         )  # fmt: skip
         return
     name = node.resolve().name
@@ -85,7 +85,7 @@ def _check_port(host: Host, path: str, ports: Sequence[SerialPortInfo]) -> Itera
         text = f"the adapter delays bytes by up to {latency_ms} ms, expected 1 ms"
         remedy = f"echo 1 | sudo tee /sys/class/tty/{name}/device/latency_timer; or {_RULES}"
         if holders:
-            yield Finding(CHECK, path, "warning", f"{text}, while a program uses it", remedy)
+            yield Finding(CHECK, path, "warning", f"{text}, while a program uses the port", remedy)
         else:
             text += "; the daemon requests 1 ms when it opens the port"
             yield Finding(CHECK, path, "note", text, remedy)

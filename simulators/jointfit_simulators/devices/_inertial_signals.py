@@ -5,8 +5,10 @@ The signals follow from two successive orientations, without noise:
 .. math:: \omega = \log(q_{k-1}^{*} q_k) / T, \qquad f = R_k^{T} (0, 0, g), \qquad
     m = R_k^{T} (0, \cos\delta, -\sin\delta)
 
-A simulated device has an orientation but no position, so the specific force contains gravity only.
-A device with `SensorErrors` measures these signals with bias, scale errors and noise.
+T is the time between the two orientations, R_k is the matrix of q_k, and δ is the inclination of
+the magnetic field. A simulated device has an orientation but no position, so the specific force
+contains gravity only. A device with `SensorErrors` measures these signals with bias, scale errors
+and noise.
 """
 
 from __future__ import annotations
@@ -48,7 +50,7 @@ class InertialSignals:
         self._q: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
     def update(self, device_ns: int, q_world_sensor: Quaternion) -> None:
-        """Add the orientation at the next time."""
+        """Add the orientation at `device_ns`, which is later than the previous time."""
         if self._last is not None:
             at_ns, before = self._last
             self._turn = _rotation_between(before, q_world_sensor)

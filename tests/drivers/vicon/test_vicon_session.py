@@ -1,4 +1,4 @@
-"""Connection to Vicon: handshake, changes, search, diagnosis, and the vendor's client."""
+"""Connection to Vicon: handshake, changed subjects, search, diagnosis, and the vendor's client."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def made(**options: Any) -> ViconServer:
 
 
 def served(server: ViconServer, *, sends: bool = True) -> AbstractAsyncContextManager[None]:
-    """Answer, and send a frame every 10 ms."""
+    """Run a server that answers and, if `sends`, sends a frame every 10 ms."""
 
     def push() -> None:
         server.push(time.monotonic_ns(), {"T1": (0.1, 0.2, 0.3)}, {"Thigh": POSE})

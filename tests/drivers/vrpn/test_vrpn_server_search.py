@@ -1,4 +1,4 @@
-"""Search for VRPN servers, the causes of missing poses, and the question to a silent server."""
+"""Search for VRPN servers, the causes of missing poses, and the query to a silent server."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The WitMotion driver with devices of every setting, and the settings that it writes."""
+"""The WitMotion driver with differently configured devices, and the settings that it writes."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_writes_are_accepted_for_ten_seconds_after_the_key(tmp_path: Path) -> No
     assert imu.registers[WitMotionRegister.CONTENT] == FACTORY_CONTENT
     imu._receive(UNLOCK)
     now = 119.9
-    imu._receive(b"\xff" + command)  # a stray byte before it
+    imu._receive(b"\xff" + command)  # a stray byte before the command
     assert imu.registers[WitMotionRegister.CONTENT] == WITH_QUATERNION
     imu.unplug()
 

@@ -1,4 +1,4 @@
-"""Limits of size and duration for a difference of two sensors of a segment to be a fault."""
+"""Size and duration from which on a difference between two sensors of a segment is a fault."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ BEGIN_NS = 7_000_000_000
 
 
 def first_change(debouncer: FaultDebouncer, difference: float) -> int | None:
-    """Return the time, ms, after which a constant difference starts or ends the fault; limit 1."""
+    """Return the time, ms, after which a constant difference starts or ends the fault.
+
+    The limit of the difference is 1.
+    """
     for ms in range(0, 4000, 10):
         if debouncer.update(BEGIN_NS + ms * MS, difference, 1.0):
             return ms

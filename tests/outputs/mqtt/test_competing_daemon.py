@@ -78,7 +78,7 @@ async def test_newer_daemon_waits_until_the_first_is_gone(
     async with contextlib.AsyncExitStack() as newer:
         async with daemon_link(port, version) as older:
             await until(lambda: older.connected)
-            await asyncio.sleep(2.2)  # after its own start period
+            await asyncio.sleep(2.2)  # longer than SHORT_S: the older daemon is established
 
             newcomer = await newer.enter_async_context(daemon_link(port, version))
             await until(lambda: bool(refusals(caplog)))
@@ -112,8 +112,9 @@ async def test_newer_daemon_publishes_nothing_and_leaves_the_first_connected(
         await asyncio.sleep(0.1)
         assert older.connects == 1
 
-        # The earlier retained state of the older daemon may arrive: always with MQTT 3.1.1, and
-        # with the embedded broker if it was stored during the subscription.
+        # The retained state that the older daemon published earlier may arrive as well. With MQTT
+        # 3.1.1 the broker always sends it. With MQTT 5 only the embedded broker may send it, if it
+        # stored the state during the subscription.
         reader, new = watcher.messages(), list[Incoming]()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(0.1):
@@ -137,7 +138,10 @@ async def test_stored_state_of_a_dead_daemon_does_not_stop_a_new_one(
 
 @pytest.fixture
 def unseen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Prevent the daemons from detecting each other before they connect, as after a joint start."""
+    """Prevent the daemons from detecting each other before they connect.
+
+    Two daemons that start at the same time do not detect each other either.
+    """
 
     async def is_in_use(settings: MqttSettings, offline: bytes) -> bool:
         del settings, offline
@@ -177,7 +181,7 @@ CONNACK, TAKEN_OVER = b"\x20\x03\x00\x00\x00", b"\xe0\x02\x8e\x00"
 
 @pytest.mark.usefixtures("unseen")
 async def test_takeover_reason_of_the_broker_suffices(caplog: pytest.LogCaptureFixture) -> None:
-    """mosquitto 2.0.11 and iotcore send no reason; later releases of mosquitto do."""
+    """Later releases of mosquitto send this reason; mosquitto 2.0.11 and iotcore send none."""
     serving: list[asyncio.Task[None] | None] = []
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -117,7 +117,7 @@ def test_an_optional_object_of_another_server_version_leaves_the_others_readable
     short = vicon.OpaqueObject(kind, b"\1")
     frame = vicon.FrameInfo(7)
     decoded = vicon.decode(vicon.encode(short, frame))
-    known = kind == ObjectId.APPLICATION_INFO  # one byte is its whole layout
+    known = kind == ObjectId.APPLICATION_INFO  # its layout is one byte
     assert decoded == vicon.Packet((vicon.ApplicationInfo(1) if known else short, frame))
 
 

@@ -1,4 +1,4 @@
-"""Setup messages of Xbus devices: values to bytes and back; documented bytes."""
+"""Setup messages of Xbus devices: encoding, decoding, and documented bytes."""
 
 from __future__ import annotations
 

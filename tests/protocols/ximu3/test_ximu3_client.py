@@ -1,4 +1,4 @@
-"""The vendor's client reads the encoder's messages: the same values to the last bit."""
+"""The vendor's client and the codec read equal values, to the last bit, from the same bytes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ TEXTS = {
 
 
 def read_by_vendor(wire: bytes, file: Path) -> tuple[list[tuple[Any, ...]], list[str]]:
-    """Return kind, time and values of every message in the vendor's client, and its errors."""
+    """Return kind, time and values of all messages in the vendor's client, and its errors."""
     file.write_bytes(wire)
     found: list[tuple[Any, ...]] = []
     errors: list[str] = []
@@ -128,7 +128,7 @@ def test_both_count_the_same_messages_in_the_recording(tmp_path: Path, shared_da
     found, errors = read_by_vendor(wire, tmp_path / "copy.ximu3")
     assert errors == []
     assert len(found) == 203
-    assert found[1:] == read_here(wire)[1:]  # the first one is ASCII: read as float32
+    assert found[1:] == read_here(wire)[1:]  # the first message is ASCII: the client reads float32
 
 
 def test_both_refuse_the_same_malformed_lines(tmp_path: Path) -> None:
