@@ -90,7 +90,9 @@ def write_xdf_session(session: SessionData, folder: Path) -> WrittenSession:
 def _file_header(session: SessionData) -> bytes:
     info = ET.Element("info")
     _add(info, "version", "1.0")
-    if session.start_unix_ns is not None:
+    if session.start_unix_ns is None:
+        _add(info, "start_unix_ns", "unknown")  # the reader keeps the time stamps of such a file
+    else:
         start = datetime.fromtimestamp(session.start_unix_ns / 1e9, UTC)
         _add(info, "datetime", start.isoformat(timespec="milliseconds"))
         _add(info, "start_unix_ns", str(session.start_unix_ns))
@@ -170,9 +172,9 @@ def read_xdf_session(path: Path) -> SessionData:
     """Return the session of an XDF file: all streams with described channels, and the events.
 
     Time stamps are corrected by the clock offsets. In files of other programs, streams of strings
-    become events. Channels with the types PositionX to PositionZ become markers, and channels with
-    the types OrientationX to OrientationW become sensors. If the file does not contain the start
-    time of the session, the first time stamp becomes 0 s.
+    become events, and the first time stamp becomes 0 s. Channels with the types PositionX to
+    PositionZ become markers, and channels with the types OrientationX to OrientationW become
+    sensors.
 
     Raises
     ------
@@ -197,7 +199,7 @@ def read_xdf_session(path: Path) -> SessionData:
             " types PositionX or OrientationW, or streams of strings: describe the channels"
         )
     if not start:
-        # A file without the start time of the session begins at 0 s.
+        # The time stamps of a file of another program begin at 0 s.
         firsts = [s.t_s[0] for s in numeric if len(s.t_s)] + [event.t_s for event in events]
         first = float(min(firsts, default=0.0))
         numeric = [replace(stream, t_s=stream.t_s - first) for stream in numeric]

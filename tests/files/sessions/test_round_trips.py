@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,16 @@ def test_a_whole_session_is_read_back_unchanged(to: str, session: SessionData) -
     np.testing.assert_allclose(
         [e.t_s for e in found.events], [e.t_s for e in session.events], atol=1e-9
     )
+
+
+@FEW
+@given(session=session_data())
+def test_session_without_start_time_keeps_its_time_stamps_in_xdf(session: SessionData) -> None:
+    timeless = replace(session, start_unix_ns=None)
+    found = there_and_back(timeless, "xdf")
+    assert found.start_unix_ns is None
+    for group in GROUPS:
+        assert_same_group(getattr(found, group), getattr(timeless, group), WHOLE["xdf"])
 
 
 @pytest.mark.parametrize("to", ["csv", "parquet"])
