@@ -1,17 +1,17 @@
 r"""Recommended model: mean of the sensors with a posture-dependent soft-tissue correction.
 
-.. math:: \hat q = \bar q \otimes \exp\bigl(\tfrac12 [\eta_a c_a + (1 - \eta_a) T_a]
-          + \tfrac12 [\eta_b c_b + (1 - \eta_b) T_b]\bigr)
+.. math:: \hat q = \bar q \otimes \exp\bigl((1 - w) [\eta_a c_a + (1 - \eta_a) T_a]
+          + w [\eta_b c_b + (1 - \eta_b) T_b]\bigr)
 
 :math:`\bar q` is the mean of the sensors of the segment. The corrections :math:`c_a` and
 :math:`c_b` are two fits (`KernelExpert`) of :math:`\rho = \log(\bar q^* \otimes q_{ref})`. Expert a
 uses only relative rotations and generalizes to other movements. Expert b also uses the tilt of the
-segment and has smaller errors on the trained movements. Inside the training range both experts have
-equal weight. Outside, the factors :math:`\eta` decrease, and the linear trend T of `_kernel_trend`,
-which extrapolates best, replaces the experts. The factor of b decreases from the limit of the
-training range on, the factor of a from a larger distance on. The trend has no component about the
-long axis. About this axis the correction of a replaces the correction of b, and zero replaces the
-correction of a.
+segment and has smaller errors on the trained movements. The weight w of expert b is 1 in the middle
+of the training range, decreases towards its limit, and is 1/2 outside. Outside, the factors
+:math:`\eta` decrease, and the linear trend T of `_kernel_trend`, which extrapolates best, replaces
+the experts. The factor of b decreases from the limit of the training range on, the factor of a from
+a larger distance on. The trend has no component about the long axis. About this axis the correction
+of a replaces the correction of b, and zero replaces the correction of a.
 
 Invariants: the correction is zero if the segment is upright, the joint is straight and the sensors
 agree. A rotation of the world about the vertical does not change the correction.
@@ -40,7 +40,7 @@ from jointfit_daemon.limb_model._kernel_features import (
 )
 from jointfit_daemon.limb_model._kernel_tables import KernelTables
 from jointfit_daemon.limb_model._kernel_trend import trend
-from jointfit_daemon.limb_model._leverage_variance import LeverageVariance
+from jointfit_daemon.limb_model._leverage_variance import WITHIN, LeverageVariance
 from jointfit_daemon.limb_model._segment_model import Prediction, SegmentModel
 from jointfit_daemon.limb_model._weighted_mean import equal_weights, fuse, fuse_one
 
@@ -58,9 +58,9 @@ HULL = 3.0
 """
 OUTSIDE = 3.0
 """Leverage ratio of an expert above which a frame counts as extrapolation."""
-SHARE = 0.5
-"""Weight of expert b. The weights are equal, because held-out frames hardly distinguish two similar
-experts.
+OUTSIDE_WEIGHT = 0.5
+"""Weight w of expert b at a leverage ratio of 1 and above. Up to the leverage ratio `WITHIN` the
+weight is 1; between both ratios it is linear.
 """
 
 
@@ -125,19 +125,24 @@ class KernelModel(SegmentModel):
         u = relative_rotations_one(sensors, mean, q_other)
         a, ratio, b, b_ratio, (tx, ty) = self._tables.correct(u, tilts_one(mean))
 
-        # The weight of a decreases with the square root of its leverage ratio, the weight of b with
-        # its leverage ratio.
-        p = 1.0 - SHARE if ratio <= HULL else (1.0 - SHARE) * sqrt(HULL / ratio)
-        s = SHARE / b_ratio if b_ratio > 1.0 else SHARE
-        (ax, ay, az), (bx, by, bz) = a, b
-        rest, along = 1.0 - p - s, p / (1.0 - SHARE)
+        # Share of each expert: its weight times its factor. The trend has the rest.
+        inside = 1.0 if ratio <= HULL else sqrt(HULL / ratio)
+        if b_ratio >= 1.0:
+            weight = OUTSIDE_WEIGHT
+            s = weight / b_ratio
+        else:
+            weight = 1.0 - (1.0 - OUTSIDE_WEIGHT) * max(b_ratio - WITHIN, 0.0) / (1.0 - WITHIN)
+            s = weight
+        p = (1.0 - weight) * inside
+        rest = 1.0 - p - s
 
         # There is no trend about z. The correction of a replaces the correction of b, and zero
         # replaces the correction of a.
+        (ax, ay, az), (bx, by, bz) = a, b
         c = (
             p * ax + s * bx + rest * tx,
             p * ay + s * by + rest * ty,
-            along * (1.0 - s) * az + s * bz,
+            inside * (1.0 - s) * az + s * bz,
         )
 
         far = max(ratio, b_ratio)
@@ -175,5 +180,8 @@ def mix_corrections(line: Array, a: Array, a_ratio: Array, b: Array, b_ratio: Ar
     plain = inside_a * a + (1.0 - inside_a) * line
     instead_of_b = np.concatenate([line[:, :2], plain[:, 2:]], axis=1)
     tilted = inside_b * b + (1.0 - inside_b) * instead_of_b
-    mixed: Array = (1.0 - SHARE) * plain + SHARE * tilted
+
+    beyond = np.clip((b_ratio - WITHIN) / (1.0 - WITHIN), 0.0, 1.0)[:, None]
+    weight = 1.0 - (1.0 - OUTSIDE_WEIGHT) * beyond
+    mixed: Array = (1.0 - weight) * plain + weight * tilted
     return mixed

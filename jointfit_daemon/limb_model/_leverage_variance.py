@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 FARTHEST = 30.0
 """Leverage ratio above which the variance no longer increases."""
 WITHIN = 0.5
-"""Leverage ratio below which the variance is constant, for postures in the middle of the training
-range."""
+"""Leverage ratio that limits the middle of the training range. Below this ratio the variance is
+constant."""
 
 
 @dataclass(frozen=True, slots=True)

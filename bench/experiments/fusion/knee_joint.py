@@ -49,7 +49,9 @@ def joint_itself(data: Path) -> list[Result]:
     u, seen, truth = _joint(squats.training)
     training = SegmentTraining.of(squats.training.sensors[:2], None, truth)
     rho = rotation.log(rotation.multiply(rotation.conjugate(seen), truth))
-    alone = fit_expert(u, rho, ROTATIONS, [list(training.folds(BLOCKS))], tilted=False).expert
+    alone = fit_expert(
+        u, rho, ROTATIONS, [list(training.folds(BLOCKS))], np.ones(len(u)), tilted=False
+    ).expert
     figures = []
     for name, trial in judged.items():
         u, seen, truth = _joint(trial)

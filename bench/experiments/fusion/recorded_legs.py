@@ -237,11 +237,7 @@ LONG_AXIS = (
     "straight; this rotation is nearly equal in thigh and shank, and the two references "
     "also differ most in it (recorded-legs-straight-knee)"
 )
-TILT = (
-    "the first 60 % of the walk contain only its beginning; a larger weight of expert b "
-    "inside the training range reduces this error, but increases the error of untrained "
-    "sit-to-stand"
-)
+BEGINNING = "the first 60 % of the walk contain only its beginning"
 PUSH_OFF = "the first 60 % of the jump end before the push-off"
 AFTER_SQUATS = {
     "fitted, right, STS1: flexion": RISING,
@@ -258,11 +254,10 @@ LATER_PARTS = {
     "fitted, left, DJ1: shank": LONG_AXIS,
     "placed, right, walking1: thigh": LONG_AXIS,
     "placed, right, walking1: shank": LONG_AXIS,
-    "placed, right, walking1: flexion": TILT,
+    "placed, right, walking1: flexion": BEGINNING,
     "placed, right, DJ1: thigh": LONG_AXIS,
     "placed, right, DJ1: shank": LONG_AXIS,
     "placed, right, DJ1: flexion": PUSH_OFF,
-    "placed, left, walking1: flexion": TILT,
     "placed, left, DJ1: thigh": LONG_AXIS,
     "placed, left, DJ1: shank": LONG_AXIS,
 }

@@ -225,12 +225,17 @@ def walking_flexion(method: str) -> str:
     """Return the reason why untrained walking misses the threshold that `method` determines."""
     return (
         f"the threshold is the smaller error of the methods mean and patent12, here of {method}; "
-        "in walking, most of its error of thigh and shank is a rotation about axes other than the "
-        "flexion axis, which hardly changes flexion; the training movements do not determine which "
-        "correction is valid in walking"
+        "the errors of this method in thigh and shank are larger than those of the default, but "
+        "most of them are rotations about axes other than the flexion axis, so they hardly change "
+        "flexion; the training movements do not determine which correction is valid in walking"
     )
 
 
+CAUTIOUS = (
+    "the stated standard deviations are larger than these errors: their growth outside the "
+    "training range was set for untrained movements of simulated subjects "
+    "(simulated-untrained-movements)"
+)
 _DATA = (FOLDER,)
 EXPERIMENTS = (
     Experiment(
@@ -279,5 +284,6 @@ EXPERIMENTS = (
         KNEE,
         _DATA,
         headline=True,
+        known_misses={"all together: flexion within 1 sd": CAUTIOUS},
     ),
 )

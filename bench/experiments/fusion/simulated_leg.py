@@ -256,7 +256,8 @@ EXPERIMENTS = (
     ),
     Experiment(
         "simulated-leg-joint-centers",
-        f"Joint centres of {len(SEEDS)} simulated subjects from the functional calibration",
+        f"Errors of the joint centres of {len(SEEDS)} simulated subjects after the functional "
+        "calibration",
         centers,
         simulated_subjects(len(SEEDS)),
         long=True,

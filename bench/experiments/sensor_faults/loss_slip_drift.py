@@ -142,7 +142,8 @@ def slip(_: Path, degrees: float, seeds: tuple[int, ...] = SEEDS) -> list[Result
     )  # fmt: skip
     if degrees > SLIPS_DEG[0]:
         return figures
-    share = figures[0]  # the smallest slip is near the size of the soft-tissue artefact
+    # The smallest slip is about as large as the soft-tissue artefact, so not all are reported.
+    share = figures[0]
     return [Result(share.name, share.value, 100.0, 80.0, unit="%"), *figures[1:]]
 
 
@@ -178,7 +179,8 @@ def real_skin(data: Path, trained: str, deals: Sequence[int] = DEALS) -> list[Re
     alarms, seconds = [], 0.0
     for case in (LegCase(leg, deal, name) for name in REFERENCES for leg in LEGS for deal in deals):
         training = _offline(recorded_leg(data, trained, case), trained)
-        calibration = fit_offline(KNEE, [training], mounts, "mean")  # has the links of all methods
+        # The sensor links, from which faults are detected, are the same for all methods.
+        calibration = fit_offline(KNEE, [training], mounts, "mean")
 
         for movement in MOVEMENTS:
             if movement != trained:

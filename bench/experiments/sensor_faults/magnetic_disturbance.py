@@ -67,8 +67,8 @@ class Pulled(NamedTuple):
     healthy: Array
     """Values of `segment` for the subject without disturbance."""
     knee: tuple[float, float, float]
-    """RMS error of the knee rotation, rad: during the disturbance, after it, and in both periods
-    without disturbance."""
+    """RMS error of the knee rotation, rad: during the disturbance, after it, and of the undisturbed
+    subject in both periods together."""
 
 
 def _cases(

@@ -46,7 +46,9 @@ class Fitted(NamedTuple):
     """Leverage ratio of each held-out frame for each grouping, shape (n,)."""
 
 
-def fit_expert(u: Array, rho: Array, sensors: int, ways: Ways, *, tilted: bool) -> Fitted:
+def fit_expert(
+    u: Array, rho: Array, sensors: int, ways: Ways, weights: Array, *, tilted: bool
+) -> Fitted:
     """Fit one expert with the width that has the smallest squared error on held-out groups.
 
     Fits with different penalties are combined by stacking, once for each grouping. The results are
@@ -65,6 +67,8 @@ def fit_expert(u: Array, rho: Array, sensors: int, ways: Ways, *, tilted: bool) 
         Whether the expert also uses the tilts, the last three columns of `u`.
     ways : sequence of sequence of ndarray of bool, shape (n,)
         Groupings of the frames. Each grouping is a sequence of masks, one for each held-out group.
+    weights : ndarray, shape (n,)
+        Weights of the frames, with mean 1.
     """
     seen = u if tilted else u[:, : 3 * sensors]
     smooth = smooth_terms(seen)
@@ -75,8 +79,8 @@ def fit_expert(u: Array, rho: Array, sensors: int, ways: Ways, *, tilted: bool) 
         x = seen / widths_of(width, sensors, tilted=tilted)
         centers = spread_centers(x)
         basis = Basis.of(smooth, bumps(x, centers), bumps(centers, centers))
-        held = [choose(basis, rho, groups) for groups in ways]
-        score = sum(float(np.sum(each.residuals**2)) for each in held)
+        held = [choose(basis, rho, groups, weights) for groups in ways]
+        score = sum(float(weights @ np.sum(each.residuals**2, axis=1)) for each in held)
         if best is None or score < best[0]:
             best = (score, width, centers, basis, held)
     if best is None:
@@ -84,8 +88,8 @@ def fit_expert(u: Array, rho: Array, sensors: int, ways: Ways, *, tilted: bool) 
     _, width, centers, basis, held = best
 
     # Fit to all frames. The weights (shares) of the penalties result from stacking each grouping.
-    C = np.mean([fit(basis, rho, each.shares) for each in held], axis=0)
-    leverage = hull(smooth)
+    C = np.mean([fit(basis, rho, each.shares, weights) for each in held], axis=0)
+    leverage = hull(smooth, weights)
     h = np.einsum("ij,jk,ik->i", smooth, leverage, smooth)
     expert = KernelExpert(
         width=width,
@@ -98,7 +102,7 @@ def fit_expert(u: Array, rho: Array, sensors: int, ways: Ways, *, tilted: bool) 
     )
 
     unseen = tuple(rho - each.residuals for each in held)
-    return Fitted(expert, unseen, tuple(ratios(smooth, groups) for groups in ways))
+    return Fitted(expert, unseen, tuple(ratios(smooth, groups, weights) for groups in ways))
 
 
 def spread_centers(x: Array) -> Array:

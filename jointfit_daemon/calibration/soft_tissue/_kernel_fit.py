@@ -9,6 +9,7 @@ import numpy as np
 from jointfit_daemon.calibration.soft_tissue._kernel_expert_fit import fit_expert
 from jointfit_daemon.calibration.soft_tissue._kernel_trend_fit import fit_trend, unseen_trend
 from jointfit_daemon.calibration.soft_tissue._leverage_variance_fit import measure_spread
+from jointfit_daemon.calibration.soft_tissue._posture_weights import weigh_postures
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.limb_model import (
     KernelModel,
@@ -64,11 +65,12 @@ def fit_kernel_with_residuals(training: SegmentTraining) -> tuple[KernelModel, A
     if training.movements > 1:
         ways.append([training.trials == label for label in np.unique(training.trials)])
 
-    plain = fit_expert(u, rho, count, ways, tilted=False)
-    tilted = fit_expert(u, rho, count, ways, tilted=True)
+    weights = weigh_postures(u)
+    plain = fit_expert(u, rho, count, ways, weights, tilted=False)
+    tilted = fit_expert(u, rho, count, ways, weights, tilted=True)
 
     # Compute the residuals of held-out frames and their distance from the training range.
-    lines = [unseen_trend(u, rho, groups) for groups in ways]
+    lines = [unseen_trend(u, rho, groups, weights) for groups in ways]
     unseen = list(zip(lines, plain.unseen, plain.ratios, tilted.unseen, tilted.ratios, strict=True))
     residuals = [rho - mix_corrections(*each) for each in unseen]
     distances = [np.maximum(a_ratio, b_ratio) for _, _, a_ratio, _, b_ratio in unseen]
@@ -77,8 +79,8 @@ def fit_kernel_with_residuals(training: SegmentTraining) -> tuple[KernelModel, A
         sensors=count,
         plain=plain.expert,
         tilted=tilted.expert,
-        trend=fit_trend(u, rho),
-        spread=measure_spread(distances, residuals),
+        trend=fit_trend(u, rho, weights),
+        spread=measure_spread(distances, residuals, weights),
         residual_sd=_sd(residuals[-1]),
         mean_sd=_sd(rho),
     )

@@ -1,14 +1,15 @@
 r"""Ridge regression on smooth terms and bumps (kernels); stacking combines the penalties.
 
-.. math:: c_{jp} = \arg\min \sum_i w_{ij} (\rho_{ij} - c_{jp}^T g_i)^2
+.. math:: c_{jp} = \arg\min \sum_i w_i h_{ij} (\rho_{ij} - c_{jp}^T g_i)^2
           + \lambda_p n (|c_{smooth}|^2 + r_p |c_{bumps}|^2), \qquad c_j = \sum_p a_{jp} c_{jp}
 
-.. math:: a_j = \arg\min_{a \ge 0,\ \sum a \le 1} \sum_i
+.. math:: a_j = \arg\min_{a \ge 0,\ \sum a \le 1} \sum_i w_i
           \bigl(\rho_{ij} - \sum_p a_p\, \hat\rho_{ijp}\bigr)^2
 
 for every axis j. The index p counts the pairs of a penalty :math:`\lambda` and a ratio r, n is the
-number of frames, w are the Huber weights of the final fit, g the regressors, and :math:`\hat\rho`
-the predictions of held-out frames (stacking: Breiman 1996). Regressors are not centered, because
+number of frames, w are the weights of the frames with mean 1, h the Huber weights of the final fit,
+g the regressors, and :math:`\hat\rho` the predictions of held-out frames (stacking: Breiman
+1996). Regressors are not centered, because
 the regression must have no intercept. The shares a may sum to less than 1. The part of the
 correction that does not generalize to held-out frames is then omitted.
 """
@@ -108,16 +109,19 @@ class HeldOut:
     """
 
 
-def choose(basis: Basis, rho: Array, groups: Masks) -> HeldOut:
+def choose(basis: Basis, rho: Array, groups: Masks, weights: Array) -> HeldOut:
     """Hold out each group in turn, and combine the predictions of all penalties for each axis.
 
-    `rho` contains the target corrections, rad, shape (n, 3), and `groups` the mask of the frames of
-    each group. One eigendecomposition per group and ratio is sufficient for all penalties.
+    `rho` contains the target corrections, rad, shape (n, 3), `groups` the mask of the frames of
+    each group, and `weights` the weight of each frame, shape (n,). One eigendecomposition per group
+    and ratio is sufficient for all penalties.
     """
     predicted = np.empty((len(RATIOS), len(PENALTIES), *rho.shape))
     for held in groups:
         kept = basis.g[~held]
-        gram, moment = kept.T @ kept, kept.T @ rho[~held]
+        weighted = kept * weights[~held, None]
+        gram, moment = weighted.T @ kept, weighted.T @ rho[~held]
+        total = np.sum(weights[~held])
 
         for i, ratio in enumerate(RATIOS):
             root = np.sqrt(basis.shape(ratio))
@@ -125,13 +129,14 @@ def choose(basis: Basis, rho: Array, groups: Masks) -> HeldOut:
             turned = vectors.T @ (moment / root[:, None])
             seen = (basis.g[held] / root) @ vectors
             for j, penalty in enumerate(PENALTIES):
-                predicted[i, j, held] = seen @ (turned / (values + penalty * len(kept))[:, None])
+                predicted[i, j, held] = seen @ (turned / (values + penalty * total)[:, None])
 
     # The shares of the penalties are computed for each axis.
     shares, residuals = [], np.empty_like(rho)
+    roots = np.sqrt(weights)
     for axis in range(rho.shape[1]):
         A = predicted[:, :, :, axis].reshape(-1, len(rho)).T
-        found = stacking_weights(A, rho[:, axis])
+        found = stacking_weights(A * roots[:, None], rho[:, axis] * roots)
         residuals[:, axis] = rho[:, axis] - A @ found
         shares.append(found.reshape(len(RATIOS), len(PENALTIES)))
     return HeldOut(np.array(shares), residuals)
@@ -160,14 +165,14 @@ def stacking_weights(predictions: Array, y: Array) -> Array:
     return found[:count]
 
 
-def fit(basis: Basis, rho: Array, shares: Array) -> Array:
+def fit(basis: Basis, rho: Array, shares: Array, weights: Array) -> Array:
     """Return coefficients of raw regressors, shape (p, 3), from ridge fits combined by `shares`."""
-    columns = [_robust(basis, rho[:, axis], share) for axis, share in enumerate(shares)]
+    columns = [_robust(basis, rho[:, axis], share, weights) for axis, share in enumerate(shares)]
     found: Array = basis.back @ np.stack(columns, axis=1)
     return found
 
 
-def _robust(basis: Basis, y: Array, shares: Array) -> Array:
+def _robust(basis: Basis, y: Array, shares: Array, of_frames: Array) -> Array:
     """Return the coefficients of one axis, with Huber weights of the combined residuals."""
     g, n = basis.g, len(y)
     taken = [
@@ -175,7 +180,7 @@ def _robust(basis: Basis, y: Array, shares: Array) -> Array:
         for i, j in zip(*np.nonzero(shares > _SMALLEST_SHARE), strict=True)
     ]
 
-    weights: Array = np.ones(n)
+    weights: Array = of_frames
     c: Array = np.zeros(g.shape[1])
     for _ in range(PASSES):
         weighted = g * weights[:, None]
@@ -184,5 +189,5 @@ def _robust(basis: Basis, y: Array, shares: Array) -> Array:
         for share, penalty in taken:
             c += share * np.linalg.solve(gram + np.diag(penalty), moment)
         sizes = np.abs(y - g @ c)
-        weights = huber_weights(sizes, robust_scale(sizes))
+        weights = of_frames * huber_weights(sizes, robust_scale(sizes))
     return c

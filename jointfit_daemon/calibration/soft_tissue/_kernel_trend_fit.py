@@ -34,7 +34,7 @@ not amplified.
 """
 
 
-def fit_trend(u: Array, rho: Array) -> tuple[Row, Row]:
+def fit_trend(u: Array, rho: Array, weights: Array) -> tuple[Row, Row]:
     """Return the coefficients of ``[1, u]`` for the axes x and y, rad per unit.
 
     Parameters
@@ -44,20 +44,24 @@ def fit_trend(u: Array, rho: Array) -> tuple[Row, Row]:
         further sensors with the first sensor (3 columns each), and tilt (3 columns).
     rho : ndarray, shape (n, 3)
         Target corrections, rad.
+    weights : ndarray, shape (n,)
+        Weights of the frames.
     """
-    x, y = (_axis(u, rho[:, axis], axis) for axis in LEVEL_AXES)
+    x, y = (_axis(u, rho[:, axis], axis, weights) for axis in LEVEL_AXES)
     return x, y
 
 
-def unseen_trend(u: Array, rho: Array, groups: Sequence[NDArray[np.bool_]]) -> Array:
+def unseen_trend(
+    u: Array, rho: Array, groups: Sequence[NDArray[np.bool_]], weights: Array
+) -> Array:
     """Return the trend of every frame from a fit without the group of the frame, rad, (n, 3)."""
     found = np.empty_like(rho)
     for held in groups:
-        found[held] = trend(fit_trend(u[~held], rho[~held]), u[held])
+        found[held] = trend(fit_trend(u[~held], rho[~held], weights[~held]), u[held])
     return found
 
 
-def _axis(u: Array, y: Array, axis: int) -> Row:
+def _axis(u: Array, y: Array, axis: int, weights: Array) -> Row:
     """Return the coefficients of one axis, which are the mean of both fits."""
     width = u.shape[1]
     # Component `axis` of the disagreement of each further sensor. The first three columns are the
@@ -69,6 +73,6 @@ def _axis(u: Array, y: Array, axis: int) -> Row:
     row = np.zeros(1 + width)
     for columns in (pairs, [*pairs, tilt]):
         phi = np.concatenate([np.ones((len(u), 1)), u[:, columns]], axis=1)
-        found = fit_ridge(phi, y[:, None], PENALTY, SMALLEST_SCALE).coefficients[:, 0]
-        row[[0, *(1 + column for column in columns)]] += 0.5 * found
+        ridge = fit_ridge(phi, y[:, None], PENALTY, SMALLEST_SCALE, weights=weights)
+        row[[0, *(1 + column for column in columns)]] += 0.5 * ridge.coefficients[:, 0]
     return tuple(row.tolist())

@@ -22,8 +22,8 @@ training contains few frames far outside the training range.
 """
 FAR_FACTOR = 3.0
 """Error of the prior observation relative to the RMS error."""
-FAR_SHARE = 0.1
-"""Weight of the prior observation relative to all frames."""
+FAR_SHARE = 0.3
+"""Weight of the prior observation relative to the sum of all frames."""
 
 LEAST = 0.15
 """Lower bound of the coefficients a and b of `LeverageVariance`, as a fraction of the mean square
@@ -43,21 +43,25 @@ SMALLEST_LEVERAGE = 1e-12
 """Lower bound of the leverage quantile, for a training movement without motion."""
 
 
-def hull(smooth: Array) -> Array:
+def hull(smooth: Array, weights: Array) -> Array:
     """Return the matrix H, with which ``s @ H @ s`` is the leverage of a frame.
 
-    In scaled smooth terms the leverage is n s^T (S^T S + n c I)^-1 s. S contains the smooth terms s
-    of all n training frames, and c is `HULL_PENALTY`.
+    In scaled smooth terms the leverage is m s^T (S^T W S + m c I)^-1 s. S contains the smooth terms
+    s of all training frames, the diagonal matrix W their weights with the sum m, and c is
+    `HULL_PENALTY`.
     """
-    n, p = smooth.shape
+    total, p = np.sum(weights), smooth.shape[1]
     scales = np.sqrt(np.mean(smooth**2, axis=0)) + 1e-3
     g = smooth / scales
-    inverse = n * np.linalg.inv(g.T @ g + n * HULL_PENALTY * np.eye(p))
+    gram = (g * weights[:, None]).T @ g
+    inverse = total * np.linalg.inv(gram + total * HULL_PENALTY * np.eye(p))
     found: Array = 0.5 * (inverse + inverse.T) / np.outer(scales, scales)
     return found
 
 
-def measure_spread(ratios_of: Sequence[Array], residuals: Sequence[Array]) -> LeverageVariance:
+def measure_spread(
+    ratios_of: Sequence[Array], residuals: Sequence[Array], weights: Array
+) -> LeverageVariance:
     """Fit the variance as a function of the leverage ratio over all held-out frames.
 
     Every grouping contributes to the fit. Blocks of a trial are close to the rest of the trial;
@@ -70,16 +74,19 @@ def measure_spread(ratios_of: Sequence[Array], residuals: Sequence[Array]) -> Le
         Leverage ratio of each frame relative to the other groups, for each grouping.
     residuals : sequence of ndarray, shape (n, 3)
         Residual of each frame with its group held out, for each grouping, rad.
+    weights : ndarray, shape (n,)
+        Weights of the frames.
     """
     distances = np.concatenate(ratios_of)
     squares = np.concatenate([each**2 for each in residuals])
-    shares = np.full(len(distances), 1.0 / len(distances))
+    shares = np.tile(weights, len(ratios_of))
+    shares = shares / np.sum(shares)
     found = [_line(distances, square, shares) for square in squares.T]
     (ax, bx), (ay, by), (az, bz) = found
     return LeverageVariance((ax, ay, az), (bx, by, bz))
 
 
-def ratios(smooth: Array, groups: Sequence[NDArray[np.bool_]]) -> Array:
+def ratios(smooth: Array, groups: Sequence[NDArray[np.bool_]], weights: Array) -> Array:
     """Return the leverage ratio of each frame relative to all other groups, shape (n,).
 
     Parameters
@@ -88,10 +95,12 @@ def ratios(smooth: Array, groups: Sequence[NDArray[np.bool_]]) -> Array:
         Smooth terms of all training frames.
     groups : sequence of ndarray of bool, shape (n,)
         Held-out masks of one grouping.
+    weights : ndarray, shape (n,)
+        Weights of the frames.
     """
     found = np.empty(len(smooth))
     for held in groups:
-        matrix = hull(smooth[~held])
+        matrix = hull(smooth[~held], weights[~held])
         h = np.einsum("ij,jk,ik->i", smooth, matrix, smooth)
         found[held] = h[held] / max(float(np.quantile(h[~held], 0.995)), SMALLEST_LEVERAGE)
     return np.minimum(found, FARTHEST)
@@ -99,7 +108,7 @@ def ratios(smooth: Array, groups: Sequence[NDArray[np.bool_]]) -> Array:
 
 def _line(distances: Array, squares: Array, shares: Array) -> tuple[float, float]:
     """Return a, b of E(square) = a + b max(r - 1/2, 0), fitted by iterated gamma regression."""
-    typical = float(np.mean(squares)) + SMALLEST_VARIANCE
+    typical = float(shares @ squares) + SMALLEST_VARIANCE
     distances = np.append(distances, FAR)
     squares = np.append(squares, FAR_FACTOR**2 * typical)
     shares = np.append(shares, FAR_SHARE)

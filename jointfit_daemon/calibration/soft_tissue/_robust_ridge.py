@@ -1,6 +1,9 @@
 r"""Ridge regression through the origin with Huber weights.
 
-.. math:: H = \sum_i w_i g_i g_i^T + \lambda n I, \qquad C = H^{-1} \sum_i w_i g_i \rho_i^T
+.. math:: H = \sum_i w_i h_i g_i g_i^T + \lambda n I, \qquad
+          C = H^{-1} \sum_i w_i h_i g_i \rho_i^T
+
+where w are the weights of the frames with mean 1, and h the Huber weights.
 
 Regressors are scaled but not centered, because the regression must have no intercept.
 """
@@ -44,25 +47,32 @@ class Ridge:
 
 
 def fit_ridge(
-    phi: Array, rho: Array, penalty: float, smallest_scale: float = _SMALLEST_SCALE
+    phi: Array,
+    rho: Array,
+    penalty: float,
+    smallest_scale: float = _SMALLEST_SCALE,
+    *,
+    weights: Array | None = None,
 ) -> Ridge:
     """Fit rho (n, k) on phi (n, p), with five iterations of Huber weights of the residual norm.
 
     `penalty` is λ of the module's equation. `smallest_scale` is added to the RMS of each regressor,
-    so that a nearly constant regressor is not amplified.
+    so that a nearly constant regressor is not amplified. `weights` are the weights w of the frames,
+    shape (n,); by default all are 1.
     """
     n, p = phi.shape
     scales = np.sqrt(np.mean(phi**2, axis=0)) + smallest_scale
     g = phi / scales
 
-    weights = np.ones(n)
+    of_frames = np.ones(n) if weights is None else weights
+    weights = of_frames
     H, C = np.eye(p), np.zeros((p, rho.shape[1]))
     for _ in range(PASSES):
         weighted = g * weights[:, None]
         H = weighted.T @ g + penalty * n * np.eye(p)
         C = np.linalg.solve(H, weighted.T @ rho)
         sizes = np.linalg.norm(rho - g @ C, axis=1)
-        weights = huber_weights(sizes, robust_scale(sizes))
+        weights = of_frames * huber_weights(sizes, robust_scale(sizes))
 
     inverse = n * np.linalg.inv(H) / np.outer(scales, scales)
     return Ridge(C / scales[:, None], 0.5 * (inverse + inverse.T), scales)

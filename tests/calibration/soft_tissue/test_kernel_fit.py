@@ -141,10 +141,41 @@ def test_the_claim_grows_outside_of_the_training() -> None:
 
 def test_errors_beyond_the_training_are_claimed_larger_than_shown() -> None:
     rng = np.random.default_rng(2)
-    near = measure_spread([rng.uniform(0, 1, 900)], [rng.normal(0, 0.02, (900, 3))])
+    near = measure_spread([rng.uniform(0, 1, 900)], [rng.normal(0, 0.02, (900, 3))], np.ones(900))
     within = np.array(near.at(0.5))
     assert np.all((within > 0.014) & (within < 0.026))
     assert np.all(np.array(near.at(2.0)) > 1.5 * within)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_long_pauses_in_the_training_hardly_change_the_error_in_movement(seed: int) -> None:
+    """With pauses that last 17 times as long as the movement, the error grows by at most 30 %."""
+    knee, rng = Knee(seed), np.random.default_rng(seed)
+    movement, pause = 60, 1000
+    columns = (*knee.sensors, knee.other, knee.bone)
+    bends = np.abs(rot.log(rot.multiply(rot.conjugate(knee.bone[:300]), knee.other[:300]))[:, 0])
+    straight = int(np.argmin(bends))
+
+    sensors_and_bones = []
+    for q in columns:
+        rests = [
+            rot.multiply(q[straight], rot.exp(rng.normal(0, 0.2 * DEG, (pause, 3))))
+            for _ in range(5)
+        ]
+        moves = np.split(q[:300], range(movement, 300, movement))
+        pairs = [part for pair in zip(moves, rests, strict=True) for part in pair]
+        sensors_and_bones.append(np.concatenate(pairs))
+    *sensors, other, bone = sensors_and_bones
+
+    late = slice(300, N)
+    errors = [
+        knee.error(model.predict([q[late] for q in knee.sensors], knee.other[late]), late)
+        for model in (
+            fit_kernel(knee.training(slice(0, 300))),
+            fit_kernel(SegmentTraining.of(sensors, other, bone)),
+        )
+    ]
+    assert errors[1] < 1.3 * errors[0]
 
 
 def test_stacked_shares_are_a_part_of_a_whole() -> None:
@@ -193,7 +224,7 @@ def test_a_trend_of_constant_and_weights_is_found_and_bounded() -> None:
     rho[:, 1] = -0.02 - 0.3 * u[:, 4]
     rho[:, 2] = 0.3
     rho[::10] += rng.normal(0, 0.5, (40, 3))
-    rows = fit_trend(u, rho)
+    rows = fit_trend(u, rho, np.ones(400))
     clean = np.ones(400, dtype=bool)
     clean[::10] = False
     found = trend(rows, u)
