@@ -146,7 +146,7 @@ def _write_json(path: Path, measured: Measured) -> None:
 
 
 def _write_pages(measured: Measured, *, quick: bool) -> None:
-    """Generate the pages; if times were stored, also describe the machine."""
+    """Generate the pages; if times were measured, store a description of the machine first."""
     if not quick and any(experiment.topic == "speed" for experiment, _ in measured):
         storage.store(storage.MACHINE, machine())
     for path in pages.write():

@@ -23,7 +23,7 @@ def circle_bound(angles: ArrayLike, noise: float, *, known_radius: bool = False)
     .. math:: C = \sigma^2 \Big[ \sum_i u_i u_i^T \Big]^{-1}_{xy},
               \qquad u_i = (\cos\theta_i, \sin\theta_i, 1)
 
-    If the radius is known, the 1 is omitted.
+    Here θ_i is angle i, and σ is `noise`. If the radius is known, the 1 is omitted.
 
     Parameters
     ----------
@@ -63,7 +63,8 @@ def arbitrary_error(angles: ArrayLike, noise: ArrayLike) -> Array:
         E^2 = \frac{2\sigma^2 (3 - \cos\theta_{12} - \cos\theta_{13} - \cos\theta_{23})}
                    {(\sin\theta_{12} - \sin\theta_{13} + \sin\theta_{23})^2}
 
-    Source: Akbarifar et al. 2021, equation 14 with the sign of the last cosine corrected.
+    Here θ_ij is the angle of frame i minus the angle of frame j, and σ is `noise`. Source:
+    Akbarifar et al. 2021, equation 14 with the sign of the last cosine corrected.
 
     Parameters
     ----------
@@ -91,7 +92,7 @@ def triangle_error(points: ArrayLike, noise: ArrayLike) -> Array:
 
     .. math:: E = \sigma \frac{R}{2A} \sqrt{a^2 + b^2 + c^2}, \qquad R = abc / 4A
 
-    Here a, b and c are the sides, and A is the area.
+    Here a, b and c are the sides of the triangle, A is its area, and σ is `noise`.
 
     Parameters
     ----------
@@ -122,11 +123,11 @@ def _ratio(above: Array, below: Array) -> Array:
 def combine(estimates: list[CenterEstimate]) -> tuple[Array, Array]:
     r"""Combine the centers of independent markers, weighted by information.
 
-    Outliers are not rejected.
-
-    Estimates with an unobserved direction are ignored.
+    Outliers are not rejected. Estimates with an unobserved direction are ignored.
 
     .. math:: C = \Big( \sum_k C_k^{-1} \Big)^{-1}, \qquad c = C \sum_k C_k^{-1} c_k
+
+    Here c_k and C_k are the center and the covariance of marker k.
 
     Returns
     -------

@@ -65,8 +65,9 @@ class LinearCorrection(SegmentModel):
     """0.995 quantile of the leverage in training."""
     mean_leverage: float
     ratio_offset: float
-    """3 plus the mean, over held-out frames, of the leverage divided by the mean training leverage.
-    It makes the mean predicted variance unbiased.
+    """Mean of r + 3 over the held-out frames, where r is the leverage of a frame divided by the
+    mean training leverage. The predicted variance of a frame is proportional to (r + 3) divided by
+    this mean, so the mean predicted variance is unbiased.
     """
     covariance: tuple[tuple[float, ...], ...]
     """Mean outer product of held-out residuals, rad^2, 3x3, segment axes."""
@@ -179,7 +180,7 @@ def features(sensors: Sequence[Array], q_other: Array) -> Array:
 
     Here :math:`k = \log(x^* \otimes o)` is the joint rotation between the first sensor x and the
     neighbour o. :math:`d_j = \log(x^* \otimes y_j)` is the rotation from the first sensor to
-    sensor :math:`y_j`. All values are in rad.
+    sensor :math:`y_j`. Both are in rad.
 
     Parameters
     ----------

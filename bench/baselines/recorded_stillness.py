@@ -53,6 +53,8 @@ def still_from_rates(
         Specific force, m/s^2.
     rate_hz : float
         Sampling rate, Hz.
+    limits : RecordedStillnessLimits, optional
+        Thresholds; the default thresholds if omitted.
 
     Returns
     -------
@@ -80,6 +82,8 @@ def still_from_orientation(
         Orientations at a constant rate. A window with NaN is not at rest.
     rate_hz : float
         Sampling rate, Hz.
+    limits : RecordedStillnessLimits, optional
+        Thresholds; the default thresholds if omitted.
 
     Returns
     -------
@@ -109,7 +113,7 @@ def still_from_orientation(
 
 
 def _step_means(q: NDArray[np.float64], step: int) -> NDArray[np.float64]:
-    """Return the normalized means of `step` successive rows, which are `step` - 1 rows fewer."""
+    """Return the normalized means of `step` successive rows, shape (n - `step` + 1, 4)."""
     count = max(0, len(q) - step + 1)
     total = np.zeros((count, 4))
     for offset in range(step):
@@ -126,7 +130,7 @@ def _moving_spread(samples: ArrayLike, size: int) -> NDArray[np.float64]:
 
 
 def _moving_mean(values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Return the means of `size` rows centered at each row; end rows are repeated beyond the ends.
+    """Return the means of `size` rows centered at each row; beyond the ends, the end row counts.
 
     The means are computed from running sums.
     """

@@ -2,7 +2,8 @@
 r"""Recursive least squares with forgetting, compared with its batch form.
 
 Every update costs O(1). With a forgetting factor of 1, the result equals the batch fit. A factor of
-:math:`\mu = e^{-\Delta t/\tau}` averages over about tau seconds.
+:math:`\mu = e^{-\Delta t/\tau}`, with the sample period :math:`\Delta t`, averages over about tau
+seconds.
 """
 
 from __future__ import annotations
@@ -33,13 +34,14 @@ class RecursiveLeastSquares:
               \Theta \leftarrow \Theta + K (y^T - g^T \Theta),\quad
               P \leftarrow (P - K g^T P) / \mu, \qquad P_0 = I / \lambda_0
 
-    Two measures prevent wind-up. Most samples without excitation are skipped, and tr P never
-    exceeds its initial value.
+    Here g are the regressors, y the targets and w the weight of a sample (see `feed`). Two measures
+    prevent wind-up. Most samples without excitation are skipped, and tr P never exceeds its initial
+    value.
 
     Parameters
     ----------
     regressors, targets : int
-        Numbers p and m. Theta has the shape (p, m).
+        Number p of regressors, and number m of targets. Theta has the shape (p, m).
     ridge : float
         lambda_0, the weight of the prior Theta = 0.
     forgetting : float
@@ -86,7 +88,9 @@ class InformationForm:
     r"""Least squares from accumulated sums; the coefficients are computed on demand.
 
     .. math:: A \leftarrow \mu A + w g g^T,\quad B \leftarrow \mu B + w g y^T,\quad
-              \Theta = A^{-1} B
+              \Theta = A^{-1} B, \qquad A_0 = \lambda_0 I
+
+    Symbols and parameters are those of `RecursiveLeastSquares`.
     """
 
     def __init__(

@@ -45,7 +45,7 @@ class Result:
     """Desired upper limit of a time or a size. A missed target is reported, but the experiment does
     not fail."""
     ratio: float | None = None
-    """Ratio of the CPU time to that of a fixed loop of plain Python in the same run."""
+    """Ratio of the CPU time to the CPU time of a fixed loop of plain Python in the same run."""
     note: str = ""
 
     @property

@@ -3,7 +3,7 @@
 A cost is modelled as ``fixed + unit · size^exponent``. The marginal cost is the difference of the
 costs of two neighbouring sizes, divided by the difference of the sizes, so the fixed cost cancels.
 If the sizes have equal ratios, the logarithm of the marginal cost is linear in the logarithm of the
-size. Its slope is ``exponent − 1``. The slope and its confidence interval are from ordinary least
+size, with the slope ``exponent − 1``. The slope and its confidence interval are from ordinary least
 squares.
 
 Invariant: a constant that is added to all costs does not change the exponent.

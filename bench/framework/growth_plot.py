@@ -70,7 +70,7 @@ def growth_plot() -> str:
 
 
 def _flat_panel() -> list[str]:
-    """Return the cost of one frame or recording over their number, relative to the first cost."""
+    """Return the panel with the cost of one frame or recording, relative to the first cost."""
     title = "Cost of one frame or recording, relative to the first"
     parts = [_text(LEFT, FLAT_TOP - 62, title, "title")]
     for index, (_, label, color) in enumerate(FLAT_CURVES):

@@ -142,7 +142,7 @@ def _from_first(
     for part in np.split(known, np.flatnonzero(np.abs(np.diff(values[known])) > 1e7) + 1):
         if part.size:
             found[part] -= values[part[0]]
-            found[part[0]] = np.nan  # interrupts the line at a new epoch
+            found[part[0]] = np.nan  # interrupts the line at a restart of the clock
     return found
 
 
@@ -173,7 +173,7 @@ def delays(trace: Trace, about: SimulatedRun) -> Figure:
     figure.suptitle(title, fontsize=11, x=0.01, ha="left")
     axes = figure.subplots(
         len(names), 2, squeeze=False, sharey="row", width_ratios=(4, 1)
-    )  # own scales: camera delays are ms, UART delays are µs
+    )  # one scale per row: camera delays are ms, UART delays are µs
     for (over_time, spread), name in zip(axes, names, strict=True):
         color = _colors(names)[name]
         rows = trace.stamps[name]

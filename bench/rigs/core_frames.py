@@ -1,7 +1,7 @@
 """Core without time measurement: ``python -m bench.rigs.core_frames CALIBRATION FRAMES``.
 
 The bytes of four IMUs at 100 Hz are converted to poses as JSON. The start of every run costs the
-same, so the difference between two runs is the cost of their additional frames. `CALIBRATION` is a
+same, so the difference between two runs is the cost of the additional frames. `CALIBRATION` is a
 file with a calibration of the simulated subject. It is not fitted here, because a fit takes long in
 an emulation.
 """
@@ -38,7 +38,7 @@ def main(calibration: str, frames: str) -> None:
     left = int(frames)
     for event in stream:
         outputs = core.feed(event)
-        _ = core.next_deadline_ns  # the runner requests it after every event
+        _ = core.next_deadline_ns  # the runner reads the deadline after every event
         for output in outputs:
             if isinstance(output, LimbState):
                 encode_pose(output, NS_PER_S, 2 * NS_PER_S)

@@ -39,7 +39,7 @@ _TRANSFER = """() => [
 
 @dataclass(slots=True)
 class ViewerCosts:
-    """CPU share in each round, %, and memory of the server, by number of viewers."""
+    """CPU share in each round, %, and memory of the server, MB, by number of viewers."""
 
     daemon_pct: dict[int, list[float]] = field(default_factory=lambda: {n: [] for n in COUNTS})
     server_pct: dict[int, list[float]] = field(default_factory=lambda: {n: [] for n in COUNTS})

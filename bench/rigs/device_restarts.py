@@ -25,7 +25,8 @@ DELAY_MS = {"S1": 2.0, "S2": 1.0, "S3": 2.0, "S4": 1.0}
 """Minimum delay of the simulated transports, ms. Cameras answer echo requests and need no value."""
 EVERY = {*SENSORS, OPTICAL}
 PATIENCE_S = 40.0
-"""Time limit for a step, s. On an idle machine, a step takes three seconds."""
+"""Time limit of each wait for a change of the daemon's state, s. On an idle machine, a wait takes
+three seconds."""
 
 
 class RestartRun(NamedTuple):

@@ -28,7 +28,7 @@ SKIPPED_S = 1.0
 """Delay above which a message is not sent, s. At the start, messages before the time shift of the
 gateway are thus omitted."""
 DUE_KEY = b'"completed_us":'
-"""Key of a pose whose value is replaced by the time of sending. The station can then measure
+"""Key in poses. Its value is replaced by the time of sending, so that the station can measure
 delays."""
 
 

@@ -94,8 +94,8 @@ class Figures:
     """Results of one run."""
 
     latencies_ms: list[float]
-    """Latency of every frame: receipt of the frame minus arrival of the sample that completed it.
-    """
+    """Latency of every frame, ms: receipt of the pose minus arrival of the sample that completed
+    the frame."""
     seconds: float
     cpu_s: float
     """CPU time of the daemon during the measurement, s."""

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 RATE_HZ = 100.0
 POSE_BYTES = 1200
-"""Size of the payload of a pose with two segments and a joint."""
+"""Size of the payload of a pose with two segments and three joints, bytes."""
 CHANNELS = POSE_BYTES // 8
 
 

@@ -25,8 +25,8 @@ KINDS: dict[Kind, tuple[str, tuple[str, ...]]] = {
     "imus": ("IMUs, calibrated before", ("--no-mocap",)),
     "chain": ("IMUs and cameras with chain model", ("--chain-model",)),
 }
-"""Text of each recording, and options of ``jointfit-sim``. The recording `imus` uses the result of
-`cameras`."""
+"""Text of each recording, and options of ``jointfit-sim``. The recording `imus` uses the
+calibration of the recording `cameras`."""
 MOTIONS, MOTION_S = ("walk", "squat", "sit_to_stand"), 10.0
 
 

@@ -56,7 +56,8 @@ FRAME_NS, MATCH_NS = 10_000_000, 1_000_000
 """Interval between frames, ns, and tolerance of their times, ns. Truth and poses have times at
 multiples of 10 ms of the same clock, apart from rounding."""
 PLAYS, IN_TIME = 3, 0.9
-"""Maximum number of plays, and share of frames without late samples after which no play follows."""
+"""Maximum number of plays of a trial, and smallest share of frames without late samples with which
+a play is not repeated."""
 FADE_NS = 250_000_000
 """Time for which the output fades after a sensor was missing, ns."""
 CONNECT_S, PATIENCE_S = 80.0, 300.0
@@ -377,9 +378,10 @@ async def _undelayed(
     port: int,
     method: Method,
 ) -> Played:
-    """Repeat the play until enough samples are in time, at most `PLAYS` times.
+    """Return the play with the largest share of frames without late samples.
 
-    Return the play with the largest share of samples in time.
+    The trial is played at most `PLAYS` times. If the share reaches `IN_TIME`, no further play
+    follows.
     """
     best: Played | None = None
     for _ in range(PLAYS):

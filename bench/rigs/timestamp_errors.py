@@ -56,7 +56,7 @@ class ObservedSample(NamedTuple):
     error_ns: int | None
     """Error of the stamp, ns; None if the simulator has no such sample."""
     excused_ns: int
-    """Smallest delay of this clock's samples so far, in excess of the minimum delay, ns."""
+    """Part of the error that late arrivals explain, ns (see the docstring of the module)."""
 
 
 class JudgedFrame(NamedTuple):
@@ -107,7 +107,7 @@ class _Recent:
     excused_ns: list[int] = field(default_factory=list)
     epoch: int = -1
     least_ns: int = 0
-    """Delay of the fastest sample of this epoch in excess of the minimum delay, ns."""
+    """Smallest delay since the last start of the clock, in excess of the minimum delay, ns."""
 
     def excuse(self, late_ns: int | None, stamp: Stamp) -> int:
         """Add the delay of a sample; return the part of its error that the delays explain."""
@@ -156,7 +156,7 @@ class ObservedCore(Core):
         number = measured.counter if isinstance(measured, ImuSample) else measured.number
         lag_ns = self._lag_ns.get(source, 0)
         t_ns = stamp.t_ns - lag_ns
-        arrival_ns = self._now_ns  # a back-dated sample has an earlier event time
+        arrival_ns = self._now_ns  # not `measured.arrival_ns`, which may be back-dated
         taken_ns = None if number is None else self._truth.taken_ns(source, number, arrival_ns)
         known = lag_ns or state.clock.state not in {"passive", "settling", "arrival"}
         unseen_ns = 0 if known else self._delay_ns.get(source, 0) - state.clock.latency_ns
@@ -185,7 +185,7 @@ class ObservedCore(Core):
         return super()._fuse(frame)
 
     def _error_at(self, source: str, t_ns: int) -> tuple[float, float]:
-        """Return the larger error of the two samples around `t_ns`.
+        """Return the larger error of the two samples around `t_ns`, ns.
 
         The first value is the complete error, and the second value lacks the excused part.
         """

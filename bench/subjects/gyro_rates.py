@@ -1,4 +1,4 @@
-"""Tracks of measured angular rates, to estimate the lag of a gyroscope without its filter."""
+"""Measured angular rates as input of the lag estimate, without an orientation filter."""
 
 from __future__ import annotations
 
@@ -18,7 +18,17 @@ GAP = 1.5
 
 
 def rates_from_gyro(t_ns: NDArray[np.int64], w: Array, origin_ns: int) -> Rates:
-    """Return measured rates, rad/s, shape (n, 3), as a track; rows with NaN are missing samples."""
+    """Return measured angular rates as input of the lag estimate.
+
+    Parameters
+    ----------
+    t_ns
+        Stamps, ns, shape (n,).
+    w
+        Angular rates, rad/s, shape (n, 3). Rows with NaN count as missing samples.
+    origin_ns
+        Stamp that becomes 0 s.
+    """
     seen = np.isfinite(w).all(axis=1)
     t = 1e-9 * np.asarray(np.asarray(t_ns)[seen] - origin_ns, dtype=np.float64)
     step = np.diff(t)

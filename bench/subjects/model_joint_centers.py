@@ -102,7 +102,7 @@ def _followed(
 def _positions(
     path: Path, table: TimeTable, every: int, joints: tuple[str, ...]
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the origin of every joint's child frame in every pose, z up."""
+    """Return the origin of every joint's child frame in every pose, m, z up, shape (n, 3)."""
     import opensim  # noqa: PLC0415 - optional, and slow to import
 
     opensim.Logger.setLevelString("off")

@@ -28,9 +28,9 @@ class Subject:
     """Marker positions and movement of one subject."""
 
     parent: Array
-    """Marker positions of the parent relative to the joint, m, shape (m, 3)."""
+    """Marker positions of the parent relative to the joint, m, shape (k, 3)."""
     child: Array
-    """Marker positions of the child without rotation, m, shape (m, 3)."""
+    """Marker positions of the child without rotation, m, shape (k, 3)."""
     phase: Array
     """Phases of the rotation about the three axes, rad, shape (3,)."""
 

@@ -89,6 +89,8 @@ def judge(
     ----------
     model
         An .osim file, which is not changed.
+    trial
+        Markers and frames to evaluate, in the axes of OpenSim.
     refined
         Model with refined marker positions; the default is the positions in `model`.
     accuracy

@@ -142,7 +142,7 @@ def _rig() -> Rig:
 
 
 Track = tuple["NDArray[np.int64]", "NDArray[np.int64]", "NDArray[np.int64]", "NDArray[np.bool_]"]
-"""True sampling times, device stamps, transmission times, and whether each sample is not sent."""
+"""True sampling times, device stamps, transmission times, and whether each sample is lost."""
 
 
 def _latency_ms(knobs: Knobs, name: str) -> float:
@@ -213,7 +213,8 @@ def xbus_chunk(
             ]
         ),
     )
-    return due_ns + len(data) * 10 * NS_PER_S // BAUD, data  # read with the last byte
+    # The chunk arrives with its last byte.
+    return due_ns + len(data) * 10 * NS_PER_S // BAUD, data
 
 
 def xcdi_chunk(name: str, number: int, ticks: int, due_ns: int, q: Quaternion) -> tuple[int, bytes]:

@@ -108,8 +108,9 @@ def joint_bound(paths: Array, noise: float, frame: Array = PARENT) -> float:
     .. math:: \left[ \sum_t A_t^T S_t^{-1} A_t \right]^{-1}, \qquad A_t = (U_t \; I), \quad
               S_t = σ^2 \left( I + U_t Σ_c U_t^T \right)
 
-    Here U are the directions, and the columns of I belong to the radii. Σ_c divided by σ² is the
-    effect of the fit on the center, which is common to all markers.
+    Here the rows of U_t are the unit vectors from the center to the markers in frame t, the columns
+    of I belong to the radii, and σ is `noise`. The error of the fitted parent frame displaces the
+    center with the covariance σ² Σ_c, in the same way for all markers.
     """
     u = paths / np.linalg.norm(paths, axis=-1, keepdims=True)
     k = u.shape[1]

@@ -42,7 +42,8 @@ MOVES = {
 PLATE_S, STAND_S, FUNCTIONAL_S = 24.0, 9.0, 60.0
 _CAN_BLOCKS = 7
 """Number of the last block of 256 identifiers in the range of 11-bit identifiers."""
-_LEAD_S = 2.0  # time after the start of a motion that is not used because of the transition
+_LEAD_S = 2.0
+"""Time at the start of a trial that is not used, s, because of the transition between motions."""
 
 
 @dataclass(frozen=True)

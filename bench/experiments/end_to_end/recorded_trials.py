@@ -26,7 +26,7 @@ METHODS: tuple[Method, ...] = ("mean", "patent12", "patent6", "anchored")
 WALKERS: tuple[Method, ...] = ("patent12", "patent6", "anchored")
 ALLOWED_DEG = 0.1
 REPEATED_DEG = 0.01
-"""Largest accepted angle between `pose` and the patent's regression of `sensors/pose`, deg."""
+"""Largest accepted `Played.repeated_deg`, deg: difference of poses from the patent's regression."""
 
 
 @cache

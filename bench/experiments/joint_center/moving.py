@@ -111,7 +111,7 @@ def wearer(seed: int, tissue_mm: float) -> Wearer:
 
 
 def followed(one: Wearer, moved_m: float) -> list[tuple[float, RunningCenter]]:
-    """Return times, s, and running centers; the knee center moves forward at `MOVED_AT_S`."""
+    """Return times, s, and running centers; the knee moves by `moved_m` forward at `MOVED_AT_S`."""
     rig, track = bench_rig(), one.track
     below = [*rig.calibration.markers["shank"], *rig.calibration.markers["foot"]]
     columns = [track.markers.index(name) for name in below]

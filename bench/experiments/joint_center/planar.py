@@ -44,7 +44,7 @@ WIDE = CircleLimits(0.0, (0.0, np.inf), 0.0, np.inf)
 
 
 def three_frames(_: Path) -> list[Result]:
-    """Measure the closed form against Cramer's rule, and the error of the misprinted equation."""
+    """Compare the closed form with Cramer's rule; measure the error of the misprinted equation."""
     rng = np.random.default_rng(1)
     p = rng.uniform(-1.0, 1.0, (30_000, 3, 2))
     u, v = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
@@ -90,7 +90,10 @@ SIX_NOISES_M = 1e-3 * np.array([[0.3, 1.2], [0.8, 0.4], [1.5, 0.6]])
 
 
 def unequal_noise(_: Path) -> list[Result]:
-    """Compare simulated with predicted errors for six standard deviations, and one per frame."""
+    """Compare simulated with predicted errors for unequal noise.
+
+    The noise has six standard deviations (x and y in three frames), or one per frame.
+    """
     t = np.array([0.3, 1.4, 2.9])
     drawn = np.random.default_rng(5).normal(size=(400_000, 3, 2))
     figures = []
@@ -202,7 +205,7 @@ def _rms(centers: list[Array]) -> float:
 
 
 def at_the_bound(_: Path) -> list[Result]:
-    """Measure the upper 95 % limit of RMS error over bound, for 20 000 accepted estimates."""
+    """Measure the upper 95 % limit of the RMS error of all 20 000 circles, divided by the bound."""
     figures = []
     for arc, goal in ((20, 1.15), (30, 1.15), (45, 1.03), (60, 1.03), (90, 1.03), (180, 1.03)):
         found = runs_on(100, arc, 0.002)

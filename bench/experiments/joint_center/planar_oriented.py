@@ -81,7 +81,7 @@ def rms_errors(arc: float, kind: Kind, degrees: float, runs: int) -> tuple[float
 
 
 def table(_: Path) -> list[Result]:
-    """Measure the ratio of the RMS error with angles to the RMS error of Hyper alone."""
+    """Measure the ratio of the RMS error with angles to the RMS error of the plain Hyper fit."""
     figures = []
     for arc in ARCS:
         for kind, degrees in (*STATED, *BEYOND):
@@ -97,7 +97,7 @@ def table(_: Path) -> list[Result]:
 
 
 def short_arc(_: Path) -> list[Result]:
-    """Measure errors with slow angle errors of 1° on an arc of 20°, and two ratios at 60°."""
+    """Measure the RMS errors on an arc of 20°, and the ratios of `table` for two cases at 60°."""
     with_angles, without, refused = rms_errors(20, "slow", 1.0, 200)
     figures = [
         Result("arc of 20°, slow noise of 1°: with angles", 1000 * with_angles, 28.0, unit="mm"),

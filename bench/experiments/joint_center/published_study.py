@@ -30,8 +30,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 EXPECTED = {"α–σ": (0.98, 0.81), "r–σ": (1.00, 0.99), "r–α": (0.96, 0.91)}
-"""Correlations from an independent implementation, at the clipping limit that is nearest to the
-publication."""
+"""Two correlations from an independent implementation, by pair of the quantities noise σ, radius r
+and rotation angle α: of predicted and analytic errors, and of analytic errors and grid search. The
+errors are clipped at the limit that reproduces the publication best (`NEAREST`)."""
 LARGE_RADIUS_M = 0.07
 """Radius of the marker, m, above which the radius has little influence on the error (noise 5
 mm)."""

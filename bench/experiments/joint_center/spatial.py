@@ -54,8 +54,8 @@ NOISE = 1e-3
 
 
 AT_20, AT_45 = (2.15, 2.15, 2.28, 3.26, inf), (0.85, 0.85, 0.91, 1.00, inf)
-"""Results of other authors for the five methods of `ball_joint`, in its order, mm. The last method
-is not recommended."""
+"""Results of other authors at ranges of motion of 20° and 45°, mm, for the five methods of
+`ball_joint` in their order. The last method is not recommended, and its threshold is infinite."""
 
 
 def rms(errors: list[Array]) -> float:
@@ -94,7 +94,7 @@ def upper_rms(errors: list[Array]) -> float:
 
 
 def frame_by_frame(_: Path) -> list[Result]:
-    """Compare the streaming sphere fit with batch sums, with occluded markers."""
+    """Compare the streaming sphere fit with the batch fit, for a movement with occluded markers."""
     rng = np.random.default_rng(5)
     points = carried(star_turns(45.0, 1000)) + rng.normal(0, NOISE, (1000, 4, 3))
     points[rng.uniform(size=points.shape[:2]) < 0.1] = np.nan

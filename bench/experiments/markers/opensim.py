@@ -191,10 +191,10 @@ def refined_evenly(
 
 
 def chosen_evenness(subject: OpensimSubject, trained: Sequence[str]) -> float:
-    """Return the largest weighting exponent that does not increase the held-out error.
+    """Return the largest weighting exponent whose held-out error is within 2 % of the smallest.
 
-    Each training trial is held out in turn. Some exponents have a mean held-out error within 2 % of
-    the smallest. The largest of these exponents distributes the remaining errors most evenly.
+    The held-out error is the mean over the training trials, each of which is held out in turn. A
+    larger exponent distributes the remaining errors more evenly.
     """
     means = {}
     for power in _EVENNESS:

@@ -153,7 +153,8 @@ def integrated_plate(data: Path) -> list[Result]:
         first = int(np.flatnonzero(trial["movement"])[0])
     rates = gyr - gyr[:first].mean(axis=0)
     steps = rotation.exp(0.5 * (rates[1:] + rates[:-1]) / rate)
-    q_s = q_opt.copy()  # it starts in the optical world, so the truth is known
+    # The integration starts from the optical orientation, so both worlds are equal.
+    q_s = q_opt.copy()
     for i in range(first, len(steps)):
         q_s[i + 1] = rotation.multiply(q_s[i], steps[i])
     begin = first + int(5 * rate)

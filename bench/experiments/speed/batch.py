@@ -84,7 +84,7 @@ def recording_growth_results(quick: bool) -> list[Result]:
             shutil.rmtree(trials)
     found = growth_exponent(sizes, costs)
     note = f"± {found.half_width:.3f}, {sizes[0]} to {sizes[-1]}"
-    threshold = 1.5 if quick else 1.2  # a short run has too few recordings
+    threshold = 1.5 if quick else 1.2  # a short run has too few recordings for 1.2
     return [
         timed_result("recordings: exponent", round(found.value, 3), "", 1.05, threshold, note=note),
         *(

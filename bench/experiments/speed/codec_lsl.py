@@ -80,7 +80,7 @@ def rows(quick: bool) -> list[Result]:
         fresh.feed(Chunk(0, stream.description))
         return lambda: [fresh.feed(chunk) for chunk in chunks]
 
-    # Check that both read the same samples.
+    # Check that the codec and pylsl read the same samples.
     check = LslCodec()
     check.feed(stream.description)
     own = [message for data in wire for message in check.feed(data)]

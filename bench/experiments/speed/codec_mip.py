@@ -146,7 +146,7 @@ def _read_theirs(line: _Line, node: Any) -> float:
 
 
 def rows(quick: bool) -> list[Result]:
-    package = import_module("mscl")  # also the reference in tests
+    package = import_module("mscl")  # tests use this package as a reference
     ours: list[float] = []
     theirs: list[float] = []
     line, other = _Line(), _Line()

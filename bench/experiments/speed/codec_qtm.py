@@ -81,7 +81,7 @@ def _qtm_codec() -> Callable[[], object]:
 
 def _peer() -> Callable[[], object]:
     """Return a function that reads the same components with the vendor's package."""
-    packet_of = import_module("qtm_rt.packet").QRTPacket  # also the reference in tests
+    packet_of = import_module("qtm_rt.packet").QRTPacket  # tests use this package as a reference
     payloads = [data[qtm.HEADER.size :] for data in QTM_FRAMES]
 
     def read() -> None:

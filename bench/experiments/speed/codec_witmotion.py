@@ -68,7 +68,7 @@ class _Wire:
 
 def _peer() -> Callable[[], object]:
     """Return the receive loop of the package on the same bytes, without its thread."""
-    package = import_module("witmotion")  # also the reference in tests
+    package = import_module("witmotion")  # tests use this package as a reference
     imu = package.IMU.__new__(package.IMU)
     imu.should_exit = False
     received: list[object] = []

@@ -66,7 +66,7 @@ def own_rows(quick: bool) -> list[Result]:
 
 
 def _ours_s(file: Path) -> float:
-    """Return our CPU time per message in a file, s; the result is the time and the components."""
+    """Return our CPU time to convert a message of a file to a time stamp and four numbers, s."""
     codec = ximu3.XImu3Codec()
     read: list[object] = []  # messages with Python numbers as values
     began = time.process_time()
@@ -84,7 +84,7 @@ def _theirs_s(file: Path, *, live: bool) -> float:
     The package passes each message to a function. A Python function, as in live use, is slow. The
     fastest function is `list.append`, after which the messages are read together.
     """
-    package = import_module("ximu3")  # also the reference in tests
+    package = import_module("ximu3")  # tests use this package as a reference
     received: list[Any] = []
     read: list[tuple[float, ...]] = []
 

@@ -106,7 +106,7 @@ async def _bare(line: _Line, take: Take) -> AsyncIterator[None]:
 @contextlib.asynccontextmanager
 async def _running(work: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
     task = asyncio.create_task(work)
-    await asyncio.sleep(0.05)  # the reader is ready
+    await asyncio.sleep(0.05)  # wait until the reader is ready
     try:
         yield
     finally:

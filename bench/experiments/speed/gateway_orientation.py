@@ -34,7 +34,7 @@ def rows(quick: bool) -> list[Result]:
     return [
         per_item(
             f"raw xbus: bytes to oriented sample, {kind}",
-            lambda count=count: _work(count),  # type: ignore[misc] # bound now, not at the end
+            lambda count=count: _work(count),  # type: ignore[misc] # the value in this turn
             items=N,
             goal_us=60,
             quick=quick,

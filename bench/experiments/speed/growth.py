@@ -1,8 +1,8 @@
 """Growth of the core's CPU time and memory with sensors, segments, markers and run time.
 
-Each rig receives all chunks of a frame, then the next frame. The sizes take turns, so a busy
-machine slows all of them equally. The cost of a size is the median over the turns of the mean CPU
-time of a frame.
+Each rig receives all chunks of a frame, then the chunks of the next frame. The sizes take turns, so
+a busy machine slows all of them equally. The cost of a size is the median over the turns of the
+mean CPU time of a frame.
 """
 
 from __future__ import annotations

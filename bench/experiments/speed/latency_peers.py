@@ -1,7 +1,7 @@
 """Latency of poses, compared with programs that only send: aiomqtt, and the Lab Streaming Layer.
 
 While the daemon runs, its poses and the messages of both senders are received in turn in the same
-process, so all are delayed by the same other work.
+process, so other work of the machine delays all of them equally.
 """
 
 from __future__ import annotations

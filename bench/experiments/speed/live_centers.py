@@ -34,7 +34,8 @@ def _guide() -> MovementGuide:
 
 def _feed(frames: list[MocapFrame]) -> Callable[[], object]:
     one = _guide()
-    for i, frame in enumerate(frames[: 4 * EVERY]):  # the estimators have converged
+    # After these frames, the estimators have converged.
+    for i, frame in enumerate(frames[: 4 * EVERY]):
         one.add_mocap(frame)
         if i % EVERY == 0:
             one.update({}, 1.0)

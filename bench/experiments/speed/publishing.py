@@ -1,4 +1,4 @@
-"""CPU time to publish a pose by the daemon's connection, a minimal aiomqtt publisher, a socket.
+"""CPU time to publish a pose: with the daemon's connection, with aiomqtt alone, and by a socket.
 
 The broker is a thread that accepts connections and discards the received data. Only the CPU time of
 the publishing thread counts. As with poses, a message is sent after the previous message was
@@ -99,7 +99,7 @@ async def _measure(rounds: int) -> dict[str, list[float]]:
 
 
 def publish_rows(quick: bool) -> list[Result]:
-    """Return the CPU times, and the ratio of our time to that of the library."""
+    """Return the CPU times, and the ratio of the daemon's time to the time of aiomqtt."""
     times = asyncio.run(_measure(3 if quick else 15))
     middle = {name: statistics.median(found) for name, found in times.items()}
     loop = loop_s()

@@ -26,7 +26,7 @@ CHECKING = "import jointfit_daemon.__main__, jointfit_daemon.config"
 
 
 def _imported(code: str, count: int) -> float:
-    """Return the median time of a Python process with `code` minus that of an empty process, s."""
+    """Return how much longer a Python process with `code` takes than an empty one, s (medians)."""
     took = {code: [], "pass": []}  # type: dict[str, list[float]]
     for _ in range(count):
         for each, times in took.items():
@@ -49,7 +49,7 @@ def import_rows(quick: bool) -> list[Result]:
 
 
 def fit_rows(quick: bool) -> list[Result]:
-    """Measure the jobs of the worker process, on trials with the durations of the demo."""
+    """Measure the functional fit in this process, on trials with the durations of the demo."""
     del quick  # one fit is fast enough
     trials, rig = phases(), bench_rig()
     alignment = fit_plate_alignment(trials.align, rig.calibration).to_dict()

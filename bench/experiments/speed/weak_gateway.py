@@ -1,7 +1,8 @@
 """CPU time of the core with settings for weak gateways: lower rates, and no cameras.
 
-A core with its own rig processes one second of data of four sensors, and every pose is encoded. The
-settings take turns, so a busy machine slows all of them equally.
+Each setting has its own rig and core. In each turn, a core processes one second of data of four
+sensors, and every pose is encoded. The settings take turns, so a busy machine slows all of them
+equally.
 """
 
 from __future__ import annotations

@@ -47,7 +47,8 @@ FRAME_NS = 10 * MS
 SECONDS = 20.0
 FAST, SLOW = "07_undisturbed_fast_rotation_B", "02_undisturbed_slow_rotation_B"
 _REST = 571  # samples at rest before the movement
-_SWINGS = ((1.2, 1.1, 0.0), (0.9, 1.4, 1.0), (0.7, 1.7, 2.0))  # rad, Hz, rad about z, x, y
+_SWINGS = ((1.2, 1.1, 0.0), (0.9, 1.4, 1.0), (0.7, 1.7, 2.0))
+"""Amplitude, rad, frequency, Hz, and phase, rad, of the rotations about z, x and y."""
 
 
 def shaken(t_ns: int) -> Quaternion:
@@ -183,7 +184,11 @@ class _TimedOrientation:
 def _ahead_rms(
     truth: Sequence[Quaternion], rate_hz: float, scatter_rad: float, bend: float
 ) -> float:
-    """Return the RMS error of extrapolation by up to one period of every third sample, deg."""
+    """Return the RMS error of extrapolation by up to one period of the used samples, deg.
+
+    Every third sample is used, with a random error of RMS `scatter_rad`. `bend` is the share of the
+    estimated angular acceleration that the extrapolation uses.
+    """
     dice, period_ns = np.random.default_rng(5), round(NS / rate_hz)
     samples = []
     for k in range(0, len(truth), 3):
@@ -200,7 +205,10 @@ def _ahead_rms(
 
 
 def ahead(data: Path) -> list[Result]:
-    """Compare extrapolation with no, a part (as in the daemon) or all of the acceleration."""
+    """Measure the errors of extrapolation with different shares of the angular acceleration.
+
+    The shares are 0, `CURVATURE_SHARE` (as in the daemon) and 1.
+    """
     figures = []
     for trial, name, scatter_deg, goal in (
         (FAST, "fast", 0.0, 0.45),
@@ -227,7 +235,7 @@ STREAMS = {"S1": (1.3, 2.0), "S2": (3.7, 1.0), "S3": (6.1, 2.0), "S4": (8.8, 1.0
 
 
 def four(mode: Mode, seed: int = 7) -> list[AlignedFrame]:
-    """Return the frames of four streams with an additional exponential delay of 0.5 ms."""
+    """Return the frames of `STREAMS` with an additional exponential delay, on average 0.5 ms."""
     dice = np.random.default_rng(seed)
     arrivals: list[tuple[int, str, int]] = []
     for name, (phase_ms, least_ms) in STREAMS.items():
@@ -246,7 +254,7 @@ def four(mode: Mode, seed: int = 7) -> list[AlignedFrame]:
 
 
 def latency(_data: Path) -> list[Result]:
-    """Measure the latency from a frame's time to its completion, and its orientation errors."""
+    """Measure the time from the instant of a frame to its completion, and orientation errors."""
     figures = []
     goals: dict[Literal["smooth", "fast"], tuple[float, float, float]] = {
         "smooth": (10.5, 13.0, 0.006),
@@ -267,8 +275,10 @@ def latency(_data: Path) -> list[Result]:
 
 
 def honesty(_data: Path) -> list[Result]:
-    """Measure errors of flagged samples; one sensor reboots, another is silent for half a
-    second."""
+    """Measure the errors of samples and frames that are flagged as synchronized.
+
+    One sensor reboots, and another is silent for half a second.
+    """
     run = simulated(30.0)
     trace = traced(run.events)
     errors = true_errors(trace, run.taken_ns, run.unseen_ns)

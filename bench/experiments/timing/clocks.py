@@ -32,29 +32,29 @@ SERVER_SKEW = 42e-6
 
 
 def exponential(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
-    """Return delays of a UART with 0.3 ms of jitter."""
+    """Return delays on a UART, ns, with an exponential distribution of mean 0.3 ms."""
     return rng.exponential(3e5, n)
 
 
 def spiky(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
-    """Return delays of a UART, 2 % of which are spikes of 5 to 20 ms."""
+    """Return the delays of `exponential`, ns, of which 2 % have an additional 5 to 20 ms."""
     return rng.exponential(3e5, n) + (rng.random(n) < 0.02) * rng.uniform(5e6, 20e6, n)
 
 
 def usb_polling(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
-    """Return delays of a bus that is polled every millisecond."""
+    """Return delays on a bus that is polled every millisecond, ns."""
     return rng.uniform(0, 1e6, n) + rng.exponential(5e4, n)
 
 
 def latency_timer(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
-    """Return delays of a USB bridge with a latency timer of 16 ms."""
+    """Return delays of a USB bridge with a latency timer of 16 ms, ns."""
     return rng.uniform(0, 16e6, n)
 
 
 def passive_run(
     seed: int, delays: Delays, seconds: float
 ) -> tuple[NDArray[np.float64], DeviceClock, NDArray[np.float64]]:
-    """Return the error of every stamp, ms, the final clock, and every sigma, ms."""
+    """Return the errors of all stamps, ms, the final clock, and the sigmas of all stamps, ms."""
     rng, clock = np.random.default_rng(seed), DeviceClock(PERIOD)
     n = int(seconds * S) // PERIOD
     true = START + PERIOD * np.arange(n)
@@ -69,12 +69,12 @@ def passive_run(
 
 
 def server_ticks(t: float) -> int:
-    """Return the clock of the simulated server at host time `t`."""
+    """Return the time of the simulated server at host time `t`, ns, in ticks."""
     return int((t - START + 400 * S) * (1 + SERVER_SKEW) * (SERVER_HZ / S))
 
 
 def echo_run(seed: int) -> tuple[float, float, float]:
-    """Return the errors after 10 s and 60 s of echoes, us, and the skew error, ppm."""
+    """Return the stamp errors after 10 echoes and after 60 s, µs, and the final skew error, ppm."""
     rng, clock = np.random.default_rng(seed), DeviceClock(PERIOD)
     now, first, error = START, 0.0, 0.0
     for number in range(70):
@@ -134,7 +134,7 @@ def passive(
 
 
 def jitter(_: Path, runs: int = 60) -> list[Result]:
-    """Measure the errors of passive clocks with usual jitter."""
+    """Measure the errors of clocks that are fitted to arrival times with usual jitter."""
     figures: list[Result] = []
     skews = np.zeros(0)
     for delays, seconds, goals in (
@@ -150,7 +150,7 @@ def jitter(_: Path, runs: int = 60) -> list[Result]:
 
 
 def timer(_: Path, runs: int = 90) -> list[Result]:
-    """Measure the errors of passive clocks with a badly configured latency timer."""
+    """Measure the errors of clocks fitted to arrival times that a latency timer of 16 ms delays."""
     ten, _skews, scaled = passive(latency_timer, 10.0, (0.11, 0.25), runs)
     sixty, _skews, _scaled = passive(latency_timer, 60.0, (0.015, 0.05), runs // 3)
     ratio = "error over standard deviation"
@@ -174,7 +174,11 @@ def wraps_and_restarts(_: Path) -> list[Result]:
 
 
 def _wrapped(seed: int, clock: TickClock) -> tuple[float, float, int]:
-    """Return the largest error at the overflow, the settling time, and wrong synced stamps."""
+    """Return the largest error across the overflow, ms, and two values after the reboot.
+
+    These values are the settling time, s, and the number of stamps that are flagged as synchronized
+    but have an error above 1 ms.
+    """
     rng, device = np.random.default_rng(seed), DeviceClock(PERIOD)
     modulus = clock.modulus or 1
     worst, settled_at, wrong = 0.0, None, 0

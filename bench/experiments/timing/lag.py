@@ -1,8 +1,8 @@
 """Lag of an IMU behind the cameras, estimated from motion.
 
 In recordings, the optical data are resampled at 120 Hz with a random phase, and a random lag within
-50 ms is added to the angular rate. The true lag of both recordings is half a frame of their
-cameras, 1/240 s.
+50 ms is added to the stamps of the angular rate. The true lag of both recordings is half a frame of
+their cameras, 1/240 s.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def windows(
     quaternions: Floats | None = None,
     seed: int = 6,
 ) -> list[Window]:
-    """Estimate the lag in many windows."""
+    """Estimate the lag in successive windows, each with another random lag in its stamps."""
     rng = np.random.default_rng(seed)
     noise_deg, lost, hz = treatment
     found = []
@@ -223,7 +223,12 @@ def quaternion_input(data: Path) -> list[Result]:
 def made_up(
     seed: int, seconds: float, lag_ms: float, *, drift: float = 0.0, noise: float = 0.1
 ) -> LagTracks:
-    """Return simulated stamps and orientations of a sensor and of the cameras."""
+    """Return simulated stamps and orientations of a sensor and of the cameras.
+
+    The stamps of the sensor are late by `lag_ms`, and its clock is fast by the fraction `drift`.
+    The orientations of the cameras have noise with the standard deviation `noise` per axis, deg,
+    and the orientations of the sensor a third of this noise.
+    """
     rng = np.random.default_rng(seed)
 
     def body(t: Floats) -> Floats:

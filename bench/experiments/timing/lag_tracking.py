@@ -156,4 +156,3 @@ EXPERIMENTS = (
         SIMULATED_CLOCKS,
     ),
 )
-"""For any skew, the lag is the delay of 2 ms that no clock model can detect."""

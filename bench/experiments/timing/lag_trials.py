@@ -63,9 +63,9 @@ def all_trials(data: Path) -> list[Result]:
 def stamp_sawtooth(recording: Recording) -> tuple[float, float]:
     r"""Return the period, s, and the height, ms, of the sawtooth error of the sensor's stamps.
 
-    A stamp error e(t) adds :math:`\dot g(t) e(t)` to the residual of the lag fit. The first
-    harmonic of the error is fitted by least squares. A sawtooth of height A has the amplitude
-    :math:`A / \pi`.
+    A stamp error e(t) adds :math:`\dot g(t) e(t)` to the residual of the lag fit, where g is the
+    angular rate. The first harmonic of e is fitted by least squares. For a sawtooth of height A,
+    its amplitude is :math:`A / \pi`.
     """
     imu = rates_from_gyro(recording.t_ns, recording.gyro, 0)
     ref = rates_from_orientations(recording.t_ns, recording.optical, 0)

@@ -3,8 +3,8 @@
 The complete core processes four IMUs on UART and CAN, and cameras with one echo per second. In
 every hour, one sensor reboots and another is silent for a minute, in turn. All devices run at 5 Hz,
 so ten hours have 900 000 samples instead of 19 million. Buffers with a time limit (windows,
-histograms, buckets, echoes) fill as at full rates. Buffers with a number limit are full within
-minutes.
+histograms, buckets, echoes) fill as at full rates. Buffers with a limited number of entries are
+full within minutes.
 """
 
 from __future__ import annotations
