@@ -1,8 +1,9 @@
 /* Plugin of QEMU's user emulation that counts the instructions which a program executes.
  *
- * The translation of each block adds one operation, which increments the count whenever the block is
- * executed. The declarations below are the part of QEMU's plugin interface, version 1, that is used
- * here, because Debian does not package its header. */
+ * QEMU translates a program in blocks of instructions. For each block, the plugin adds an operation
+ * that adds the number of the block's instructions to the count whenever the block is executed. The
+ * declarations below are the part of QEMU's plugin interface, version 1, that is used here. They
+ * replace the header of the interface, which Debian does not package. */
 #include <inttypes.h>
 #include <stddef.h>
 #include <stdint.h>

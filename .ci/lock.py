@@ -22,7 +22,7 @@ def name_of(dist: Distribution) -> str:
 
 
 def main() -> None:
-    """Print one sorted line per distribution; exit with 1 if one rejects our oldest Python."""
+    """Print one sorted line per distribution; exit with 1 if one needs a newer Python."""
     project = tomllib.loads(PROJECT.read_text(encoding="utf-8"))["project"]
     oldest = project["requires-python"].removeprefix(">=") + ".0"
     locked = sorted((dist for dist in distributions() if name_of(dist) not in SKIP), key=name_of)

@@ -100,7 +100,10 @@ def _run(part: str, reports: Path, arguments: list[str], report: str = "") -> in
 
 
 def _files_of_tests_alone() -> list[str]:
-    """Return the test files with the marker `alone`, as collecting all files takes 10 seconds."""
+    """Return the test files whose text contains the marker `alone`.
+
+    Selection of the marker by pytest would collect all files, which takes 10 seconds.
+    """
     files = sorted((BUILD.parent / "tests").rglob("test_*.py"))
     return [str(path) for path in files if "mark.alone" in path.read_text(encoding="utf-8")]
 
@@ -160,7 +163,7 @@ def _counts(reports: Path, disturbed: Mapping[str, list[str]]) -> str:
             total, failures, faults, left_out = (
                 int(suite.get(key, 0)) for key in ("tests", "failures", "errors", "skipped")
             )
-            if disturbed.get(report.stem):  # all that failed here passed alone
+            if disturbed.get(report.stem):  # the failed tests of this report passed alone
                 failures = faults = 0
             passed += total - failures - faults - left_out
             failed, errors, skipped = failed + failures, errors + faults, skipped + left_out

@@ -56,7 +56,7 @@ def main() -> int:
 
 
 def row(pose: dict, begin_us: int) -> dict[str, float | None]:
-    """Return time, angles and standard deviations of one pose by column."""
+    """Return the time since `begin_us`, angles and standard deviations of a pose, by column."""
     cells = {"t_s": (pose["t_us"] - begin_us) / 1e6}
     for joint, values in pose["joints"].items():
         degrees = {key: value for key, value in values.items() if key.endswith("_deg")}

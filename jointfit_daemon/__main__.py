@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.check:
         try:
             print(rig_summary(rig), flush=True)
-        except BrokenPipeError:  # as in `jointfitd --check | head`: discard the rest
+        except BrokenPipeError:  # discard the rest of the output, as in `... --check | head`
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
 

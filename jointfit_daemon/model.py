@@ -390,7 +390,7 @@ class OpticalJoint(NamedTuple):
     position: Vector | None
     """Mean of the joint centers fixed in the two adjacent body parts, m."""
     gap: float | None
-    """Distance between these two centers, m; None unless both are visible."""
+    """Distance between these two centers, m; None unless both body parts are visible."""
     distance: float | None
     """Distance between the positions from the IMUs and from the cameras, m."""
     distance_rms: float | None

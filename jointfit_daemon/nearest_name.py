@@ -91,7 +91,7 @@ def nearest_names(name: object, known: Iterable[str], *, count: int = 1) -> list
     wanted = str(name)
     folded = wanted.casefold()
     by_folded = {other.casefold(): other for other in known if other != wanted}
-    if len(folded) <= _SHORT:  # one equal character is half of a short name
+    if len(folded) <= _SHORT:  # here, a single equal character would reach `_CUTOFF`
         candidates = [
             other
             for other in by_folded

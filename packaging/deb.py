@@ -140,7 +140,8 @@ def _install_python(tree: Path, scratch: Path, architecture: str, epoch: str) ->
     site = tree / HOME / "lib" / "python3" / "site-packages"
     site.mkdir(parents=True)
     is_compiled = architecture == THIS_ARCHITECTURE and compiler() is not None
-    # The version of this machine comes first, because its metadata list the compiled modules.
+    # The Python of this machine comes first, because the metadata of its wheel list the compiled
+    # modules.
     for python in sorted(PYTHONS, key=PYTHON.__ne__):
         wheel = _build_wheel(scratch / f"wheel-{python}", epoch, is_compiled and python == PYTHON)
         unpacked = scratch / f"site-{python}"

@@ -1,6 +1,6 @@
 """Real brokers on free loopback ports, started and stopped by tests: mosquitto and iotcore.
 
-Invariant: both are a process of this user, with MQTT 5 at ``port`` and MQTT 3.1.1 at
+Invariant: each broker is a process of this user, with MQTT 5 at ``port`` and MQTT 3.1.1 at
 ``port_of("3.1.1")``. Each can be stopped, frozen and started again on the same ports.
 """
 
@@ -83,7 +83,7 @@ class Broker(ABC):
 
     @property
     def pid(self) -> int:
-        """Number of the running process."""
+        """Process id of the running broker."""
         assert self._process is not None, "the broker is not running"
         return self._process.pid
 

@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def run_compiled(*words: str | Path, pure: bool = False) -> subprocess.CompletedProcess[str]:
-    """Run Python on the tree with compiled modules, or with `pure` on the sources of that tree.
+    """Run Python on the tree with compiled modules, or, if `pure`, on the sources of that tree.
 
     Skips the test if the tree was not built from the current sources.
     """

@@ -36,7 +36,7 @@ settings.register_profile("few", deadline=None, derandomize=True, max_examples=1
 settings.register_profile("search", deadline=None, max_examples=500)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "suite"))
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in the unit
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in the systemd unit
 # jsonschema would import this module for two seconds, for the unused format `iri`.
 sys.modules.setdefault("rfc3987_syntax", None)  # type: ignore[arg-type]  # None: import fails
 
@@ -78,7 +78,7 @@ def pytest_collection() -> Generator[None, object, object]:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Ignore files that contain experiments only, unless experiments run, to save their import."""
+    """Ignore files that contain only experiments if the part of the suite has no experiments."""
     part = config.getoption("part")
     if part not in {"parallel", "alone"} or collection_path.suffix != ".py":
         return None

@@ -148,7 +148,7 @@ def _same_word(expected: str, printed: str) -> bool:
 def _near(expected: str, printed: str) -> bool:
     digits = len(expected.partition(".")[2])
     allowed = max(LEAST_AGREEMENT * abs(float(expected)), 2.01 * 10**-digits)
-    exact = digits == 0 and abs(float(expected)) < 10  # counts, and names such as T1
+    exact = digits == 0 and abs(float(expected)) < 10  # a count, or a name such as T1
     return expected == printed if exact else abs(float(expected) - float(printed)) <= allowed
 
 
@@ -192,7 +192,7 @@ class Shell:
             self._start(command.removesuffix("&").strip())
             return ""
         out, err = self._files()
-        # A prompt for the Enter key receives it.
+        # A command that waits for the Enter key receives new lines.
         code = self._ask(f"{{ {command}\n}} >{out} 2>{err} < <(yes '')\necho $?")
         said = out.read_text("utf-8", "replace")
         assert code == "0", f"{command}\nexit code {code}\n{said}{err.read_text()}"

@@ -91,7 +91,7 @@ def batches(items: list[pytest.Item], *, waiting: bool) -> deque[Batch]:
     """Return the waiting tests or all others in batches, those with long limits first.
 
     Tests of a file that share fixtures are in one batch. Other tests are divided. An experiment, or
-    a test with its own time limit, is long and therefore a batch.
+    a test with its own time limit, is long and therefore a batch of its own.
     """
     chosen = [index for index, item in enumerate(items) if waits(item) is waiting]
     found: list[Batch] = []
@@ -124,7 +124,7 @@ class _Worker:
     left: Batch = field(default_factory=list)
     """Tests that the worker has received and not finished. The first one is running."""
     began_s: float = 0.0
-    """Monotonic time at which the first of these tests started, s."""
+    """Monotonic time at which the first test in `left` started, s."""
 
 
 class _Workers:

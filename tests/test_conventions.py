@@ -70,7 +70,7 @@ def code_lines(path: Path) -> frozenset[int]:
 
 
 def lines_of(path: Path, function: Function) -> int:
-    """Return the lines of code of a function from its name to its end."""
+    """Return the number of code lines of a function, from its name to its end."""
     return len(code_lines(path) & set(range(function.lineno, (function.end_lineno or 0) + 1)))
 
 

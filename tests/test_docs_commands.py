@@ -46,8 +46,8 @@ TESTED_PROGRAMS = {
     "jointfit", "jointfitd", "jointfit-sim", "mosquitto_pub", "mosquitto_sub", "openssl",
     "awk", "cd", "head", "printf", "python", "sleep",
 }  # fmt: skip
-"""Programs that a test of a page may start. A page that needs another one, for example one that
-asks the service manager, gets a reason in `NOT_RUN` or extends this set.
+"""Programs that a test of a page may start. If a page needs another program, add the program here.
+If no test can run the command, such as one for the service manager, add a reason to `NOT_RUN`.
 """
 MAN_PAGES = sorted((ROOT / "packaging" / "man").glob("*.1"))
 

@@ -25,7 +25,7 @@ def quotes(page: str) -> list[str]:
 
 @cache
 def program_texts() -> str:
-    """Return all strings of the program; values are `PLACE`."""
+    """Return all strings of the program, with `PLACE` instead of each inserted value."""
     texts = [path.read_text(encoding="utf-8") for path in sorted(SCRIPTS.glob("*.js"))]
     for package in PROGRAM:
         for path in sorted((ROOT / package).rglob("*.py")):

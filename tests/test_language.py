@@ -31,16 +31,16 @@ RATES_PER_1000 = {
     r"nobody|somebody|whoever|whom|who": 0.5,
     r"anew|for ever|mend(?:s|ed)?|errs|beside|(?<!-)worn": 0.5,
 }
-"""Pattern of words to largest number in 1000 words."""
+"""Largest number of occurrences in 1000 words, by pattern."""
 BANNED = re.compile(
     r"\b(?:law|flesh|bulletin|asleep|moods?|verdicts?|unlearn\w*|whose turn|worn since"
     r"|gives? up|look(?:s|ed)? after|put on anew)\b",
     re.IGNORECASE,
 )
-"""Words that a standard term replaces: invariant, soft tissue, notice, stuck, outcome, revert,
+"""Words for which standard terms exist: invariant, soft tissue, notice, stuck, outcome, revert,
 drop, re-donned."""
 ALLOWED = {
-    "docs/accuracy",  # the generated tables name experiments of other authors in their words
+    "docs/accuracy",  # tables with names by other authors
     "jointfit_daemon/tools/dashboard/page/vendor",  # libraries of other authors
 }
 
@@ -78,7 +78,7 @@ def manual(text: str) -> str:
 
 
 def page_texts(text: str) -> str:
-    """Return the strings that hold more than one word; of a page also the texts between tags."""
+    """Return the strings of more than one word; from HTML also the texts between tags."""
     strings = [found for found in re.findall(r'"[^"\n]*"|`[^`]*`', text) if " " in found]
     if text.startswith("<!doctype"):
         strings.append(re.sub(r"<[^>]*>", " ", text))
@@ -92,7 +92,7 @@ PLACES: list[tuple[Reader, str, str]] = [
     (manual, "packaging/man", ".1"),
     *((page_texts, "jointfit_daemon/tools/dashboard/page", suffix) for suffix in (".js", ".html")),
 ]
-"""How to read the files with a suffix below a path of the project."""
+"""Reader of the files, path below the project, and suffix of the files."""
 everywhere = pytest.mark.parametrize(
     ("reader", "name", "suffix"),
     PLACES,

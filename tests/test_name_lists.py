@@ -1,4 +1,4 @@
-"""Lists of names in messages."""
+"""Lists in messages contain every name, or the number of omitted names."""
 
 from __future__ import annotations
 

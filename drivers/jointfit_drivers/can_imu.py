@@ -1,4 +1,4 @@
-"""Connection of an IMU on a CAN bus."""
+"""Settings of the connection of an IMU to a CAN bus."""
 
 from __future__ import annotations
 

@@ -116,7 +116,7 @@ class CheckedSamples(Refusals):
         return [self.refuse(held.size, "time and counter disagree with the other samples")]
 
     def _admit(self, sample: ImuSample, size: int) -> list[Decoded]:
-        """Return the sample with a unit quaternion, or the reason for rejecting the sample."""
+        """Return the sample with a unit quaternion, or the event of its rejection, and warnings."""
         q = self._gate.admit(sample.q_world_sensor)
         if q is not None:
             checked = sample._replace(q_world_sensor=q)
@@ -135,7 +135,7 @@ class CheckedSamples(Refusals):
         return out
 
     def _rate_warning(self, ticks: int) -> list[Decoded]:
-        """Return a warning, once, if the device time of the first samples shows another rate."""
+        """Return a warning, once, if the device time of the first samples contradicts `rate_hz`."""
         last, self._last_ticks = self._last_ticks, ticks
         if last is None:
             return []

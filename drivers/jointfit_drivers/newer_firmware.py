@@ -42,7 +42,7 @@ class NewestKnown:
 
     @property
     def text(self) -> str:
-        """Version as text. If it has one number, ``.x`` stands for the other numbers."""
+        """`version` as text. If `version` has one number, ``.x`` stands for the other numbers."""
         return ".".join(map(str, self.version)) + (".x" if len(self.version) == 1 else "")
 
 
@@ -69,7 +69,7 @@ class NewerFirmwareDetector:
         self._sightings = sightings
         self._found = ""
         self._reported = ""
-        self._seen: dict[str, tuple[int, int]] = {}  # count, and arrival of the first, ns
+        self._seen: dict[str, tuple[int, int]] = {}  # count, arrival of the first content, ns
 
     @property
     def is_settled(self) -> bool:

@@ -24,5 +24,8 @@ class Refusals:
         return Corrupt(size, reason, rejected=1)
 
     def flush(self) -> list[Decoded]:
-        """Reject a sample that waits for confirmation. Only subclasses have such samples."""
+        """Reject the sample that waits for confirmation, and return the events.
+
+        Only subclasses have such samples.
+        """
         return []

@@ -24,8 +24,8 @@ log = logging.getLogger(__name__)
 _QUIET_S = 0.1
 """Pause after which the rest of a message with a corrupt length is no longer expected, s."""
 _KEPT = 8192
-"""Number of bytes stored before the first reply. This number exceeds the size of one message plus
-the data that arrive together with it."""
+"""Largest number of bytes stored before the first reply. This number exceeds the size of one
+message plus the data that arrive together with it."""
 _LOGGED = 20
 """Number of chunks logged at debug level, so that the log contains raw data of a new device."""
 
@@ -102,9 +102,9 @@ class SerialConversation(Generic[Message]):
     async def ask(
         self, request: bytes, is_reply: Callable[[Message], bool], *, tries: int, wait_s: float
     ) -> Message | None:
-        """Send a request, and repeat it up to `tries` times in all; return its reply.
+        """Send a request up to `tries` times, and return the first reply.
 
-        Each time, wait at most `wait_s` seconds. Return None if no reply arrives.
+        Wait at most `wait_s` seconds after each request. Return None if no reply arrives.
         """
         for _ in range(tries):
             await self.send(request)

@@ -34,8 +34,9 @@ class CountingCodec(StreamCodec[Found_co], Protocol[Found_co]):
 
 
 class SerialMessageDecoder(ABC, Generic[Message]):
-    """Decoder of one device. A subclass converts each message; `_arrival_of` returns its stamp.
+    """Decoder of one device.
 
+    A subclass converts each message in `_take`, and `_arrival_of` returns the stamp of a message.
     After a silence, the decoder discards an incomplete message.
 
     Parameters
@@ -105,7 +106,7 @@ class SerialMessageDecoder(ABC, Generic[Message]):
 
     def _append(self, found: Sequence[Message | CorruptBytes], out: list[Decoded]) -> None:
         for item in found:
-            if type(item) is CorruptBytes:  # half the time of isinstance()
+            if type(item) is CorruptBytes:  # takes half the time of isinstance()
                 out += self._take_corrupt(item)
             else:
                 out += self._take(item)

@@ -141,7 +141,7 @@ class ArrivalStamps:
     def stamp(self, bytes_since: int) -> int:
         """Return the arrival of a byte `bytes_since` bytes before the chunk's end, monotonic ns.
 
-        A stamp is never earlier than the last stamp. Otherwise USB devices and pseudoterminals,
+        A stamp is never earlier than the previous stamp. Otherwise USB devices and pseudoterminals,
         which are faster than `baud`, would have decreasing stamps.
         """
         at_ns = self.chunk_ns - round(bytes_since * self._byte_ns)

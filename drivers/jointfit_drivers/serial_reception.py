@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     Start = Callable[[SerialPort, bool], Awaitable[None]]
 
 _HUNT_EVERY = 10
-"""One in this number of connection attempts also searches at other line speeds. A search takes
-longer than an attempt."""
+"""One in this number of connection attempts also searches at other line speeds. Such an attempt
+takes longer than the others."""
 
 
 class SerialReception:

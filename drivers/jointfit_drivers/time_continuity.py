@@ -37,7 +37,8 @@ _GAIN = 0.125
 """Weight of a new step in the running mean of the period."""
 _PACE_NS = 250_000_000
 """Largest difference between elapsed device time and elapsed arrival time without a restart or a
-backlog, ns. After the same time with messages at the device's own rate, the delay is known."""
+backlog, ns. The delay of the messages is known after messages have arrived at the device's own rate
+for this time."""
 _LATEST_NS = 30_000_000_000
 """Longest delay of the first messages after the port is opened, ns."""
 
@@ -130,7 +131,7 @@ class TimeContinuity:
                 self._first_steps.clear()
             return 0
 
-        # A first or a different period is used from its third step on.
+        # A new period is used after three consecutive steps of about the same size.
         steps = self._first_steps
         if steps and abs(step_ns - steps[0]) > _ALIKE * steps[0]:
             steps.clear()

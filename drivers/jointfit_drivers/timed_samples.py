@@ -85,13 +85,14 @@ class TimedSamples(Refusals):
             out: list[Decoded] = []
             if not self._untimed:
                 self._untimed = True
-                text = f"orientation without device time in its message: {self._untimed_remedy}"
+                text = f"measurement without device time in its message: {self._untimed_remedy}"
                 out.append(DeviceEvent("warning", text))
 
-            # An orientation without device time is stamped with its arrival, unless other readings
-            # have a device time. The filter of raw measurements needs a device time.
+            # An orientation without device time is stamped with its arrival. It is rejected if
+            # earlier readings have a device time. Raw measurements without device time are always
+            # rejected.
             if self._timed or self._make_raw is not None:
-                return [*out, self.refuse(reading.size, "orientation without time")]
+                return [*out, self.refuse(reading.size, "measurement without device time")]
             return out + self._samples(reading)
 
         self._timed = True
@@ -121,7 +122,7 @@ class TimedSamples(Refusals):
         return [] if held is None else [self.refuse(held.size, "time disagrees with the others")]
 
     def _samples(self, reading: TimedReading) -> list[Decoded]:
-        """Return the samples of an accepted reading."""
+        """Return the samples and events of an accepted reading."""
         if reading.raw is not None and self._raw is not None:
             rate, force, magnetic = reading.raw
             ticks = reading.ticks or 0

@@ -117,7 +117,7 @@ def _weight(i: int, w: Array, knowledge: Array, centers: Array) -> float:
     spread = np.linalg.inv(P.T @ knowledge[i] @ P) + P.T @ B @ np.linalg.inv(shown) @ B.T @ P
     gap = P.T @ (centers[i] - m)
     square = float(gap @ np.linalg.solve(spread, gap)) / len(gap)
-    distance = sqrt(max(square, 0.0))  # rounding may make a nearly singular covariance negative
+    distance = sqrt(max(square, 0.0))  # negative only by rounding, if `spread` is nearly singular
 
     return min(1.0, TOLERATED / max(distance, 1e-12)) ** 2
 

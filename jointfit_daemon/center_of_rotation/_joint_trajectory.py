@@ -138,7 +138,7 @@ def _in_world(side: JointSide, center: Array) -> Array:
 def _agreeing_track(side: JointSide, reference: Array) -> Array:
     """Return the positions from one side, shifted to `reference` along unobserved directions.
 
-    After the shift, both tracks have the same mean along these directions.
+    After the shift, the result and `reference` have the same mean along these directions.
     """
     center, unseen = side.estimate.center, side.estimate.unseen
     other = side.poses.to_body(reference[:, None])[:, 0] @ side.basis
@@ -149,7 +149,7 @@ def _agreeing_track(side: JointSide, reference: Array) -> Array:
         center = center + unseen.T @ (unseen @ (other[shared].mean(axis=0) - center))
 
     found = _in_world(side, center)
-    if len(center) == len("xy"):  # along the normal of the plane, both tracks get the same mean
+    if len(center) == len("xy"):  # the mean along the normal of the plane is also shifted
         normal = np.cross(*side.basis.T)
         found = found + normal * ((reference - found)[shared] @ normal).mean()
     return found

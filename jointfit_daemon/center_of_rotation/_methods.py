@@ -124,7 +124,7 @@ def _automatic(movement: Movement) -> str:
 
 
 def _beyond_parent(found: CenterEstimate, parent: Array | None) -> CenterEstimate:
-    """Return the estimate; refuse it if its rotation may be noise of the parent's frame only."""
+    """Return the estimate, refused if noise of the parent's frame may be its only rotation."""
     if parent is None or found.refused is not None or len(found.center) < 3:
         return found
     turn = sqrt(NOISE_FACTOR) * turn_noise(parent, found.noise)

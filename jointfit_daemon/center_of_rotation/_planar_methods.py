@@ -87,9 +87,9 @@ def grid(p: Array, _: Movement) -> CenterEstimate:
 def three_frames(p: Array, movement: Movement) -> CenterEstimate:
     """Estimate the center from three frames of one marker.
 
-    The frames are the first, middle and last position on the arc. Their noise is estimated from all
-    frames. If the optical system reports a residual for every position, the noise of a frame is
-    proportional to its residual.
+    The method uses the frames with the first, the middle and the last position on the arc. The
+    noise is estimated from all frames. If the optical system reports a residual for every position,
+    the noise of a frame is proportional to its residual.
     """
     whole = circle_estimate(p, limits=LIMITS)
     if whole.refused is not None:
@@ -103,7 +103,7 @@ def three_frames(p: Array, movement: Movement) -> CenterEstimate:
     chosen = [order[0], middle, order[-1]]
     noise = whole.noise * _relative_noise(movement.residuals, visible)[chosen]
     found = three_frame_estimate(seen[chosen], noise[:, None])
-    return replace(found, bound=whole.bound)  # Cramér-Rao bound of all frames
+    return replace(found, bound=whole.bound)  # the Cramér-Rao bound for all frames
 
 
 def _relative_noise(residuals: Array | None, visible: NDArray[np.bool_]) -> Array:

@@ -32,7 +32,7 @@ class BranchedLimb(NamedTuple):
     left: tuple[bool, ...]
     """Whether each joint is on the left side."""
     distals: tuple[str | None, ...]
-    """Body part distal of the last joint of each branch; None if there is none."""
+    """Body part distal of the last joint of each branch; None for a branch without such a part."""
 
 
 def branched_limb(table: ChainTable) -> BranchedLimb:
@@ -138,7 +138,7 @@ def _check_parents(table: ChainTable) -> Iterator[Fault]:
 
 
 def _check_connection(table: ChainTable) -> Iterator[Fault]:
-    """Check that there is one root, and that no joints form a cycle."""
+    """Check that every segment has a joint, that there is one root, and that there is no cycle."""
     used = {name for joint in table.joint for name in (joint.parent, joint.child)}
     roots = _roots(table)
     for segment in (name for name in table.segments if name not in used):
@@ -168,7 +168,10 @@ def _check_connection(table: ChainTable) -> Iterator[Fault]:
 
 
 def _check_shape(table: ChainTable) -> Iterator[Fault]:
-    """Check that the root has two joints and every other segment exactly one."""
+    """Check the number of joints at the distal end of each segment: two at the root, else one.
+
+    No joint may have the name of the origin.
+    """
     root = _roots(table)[0]
     for segment in table.segments:
         names = [joint.name for joint in table.joint if joint.parent == segment]

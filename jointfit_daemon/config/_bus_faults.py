@@ -73,8 +73,8 @@ def likely_interface(interface: str) -> str:
 def complete_bus(partial: CanBusSettings, name: str) -> CanBusSettings:
     """Return a bus in which valid values replace the wrong keys, which are None in `partial`.
 
-    The replaced values cause no further fault. `name` must be unique: buses with equal settings
-    count as one bus, whose sensors must have different identifiers.
+    The valid values cause no further fault. `name` must be unique: buses with equal settings count
+    as one bus, whose sensors must have different identifiers.
     """
     channel = f"/dev/{name}" if partial.interface in SERIAL_ADAPTERS else name
     valid = dict(CanBusSettings(interface="virtual", channel=channel))

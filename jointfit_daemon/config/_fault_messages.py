@@ -153,7 +153,7 @@ def _description_of(fields: Mapping[str, Any], name: object) -> str:
 
 
 def _model_at(model: type[BaseModel], loc: Sequence[int | str]) -> type[BaseModel] | None:
-    """Return the model whose fields are the keys at `loc`; None if it is not a model."""
+    """Return the model whose fields are the keys at `loc`; None if no model is at `loc`."""
     here: type[BaseModel] | None = model
     for part in loc:
         if isinstance(part, int):

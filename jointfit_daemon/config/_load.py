@@ -134,7 +134,7 @@ class _RigReader:
         self.imus_read: list[Source] = []
         """All IMUs whose tables are readable, even if the tables have faults."""
         self.imus_with_load: list[Source] = []
-        """IMUs of `imus_read` with known load. A faulty key has the value of the smallest load."""
+        """IMUs of `imus_read` with known load. Faulty keys have the values with the least load."""
         for key in table:
             if key not in SECTIONS:
                 known = f"unknown table; known: {', '.join(SECTIONS)}"
@@ -293,7 +293,7 @@ class _RigReader:
         if not isinstance(table, dict):
             self.faults.append(Fault(key, "expected a table", table))
             return None
-        try:  # strict JSON mode accepts no string as a number, but arrays as tuples
+        try:  # strict JSON mode accepts arrays as tuples, but no strings as numbers
             return model.model_validate_json(json.dumps(table, default=str), strict=True)
         except ValidationError as error:
             self.faults += faults_of(error, model, key)

@@ -234,7 +234,7 @@ def _replacement(line: str, at: int) -> str:
     if line.startswith("["):
         header = _HEADER.match(line)
         if header is None:
-            return f"[{UNREADABLE}-{at}]"  # the keys after it belong to no other table
+            return f"[{UNREADABLE}-{at}]"  # the keys that follow belong to no other table
         return f"[[{header[1]}]]" if header[1] == "imu" else f"[{header[1]}]"
     key = _KEY.match(line)
     if key is None:

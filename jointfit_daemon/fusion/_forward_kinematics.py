@@ -163,7 +163,8 @@ def joint_angle_estimate(
 
     first, second = proximal.flexion_sd, distal.flexion_sd
     if convention in {AngleConvention.ELEVATION, AngleConvention.TILT_TORSION}:
-        first = second = None  # the main axis of these conventions is not the x axis of a segment
+        # In these two conventions the main axis is not the x axis of a segment.
+        first = second = None
     total = (proximal.sd if first is None else hypot(first, proximal.fault_sd)) ** 2
     total += (distal.sd if second is None else hypot(second, distal.fault_sd)) ** 2
     if first is not None and second is not None:

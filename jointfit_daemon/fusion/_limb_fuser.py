@@ -108,7 +108,7 @@ class LimbFuser:
         for i, segment in enumerate(chain.segments):
             stored = calibration.segment[segment]
             self._fusers.append(fuser(segment, chain.sensors[i], stored))
-            known = configured_length(chain, i)  # overrides the calibration, and is exact
+            known = configured_length(chain, i)  # replaces the calibrated length, without error
             estimated = SegmentLength(stored.length, stored.length_sd or 0.0)
             self._lengths.append(estimated if known is None else SegmentLength(known, 0.0))
         self._neighbors = [neighbor(chain, i) for i in range(len(chain.segments))]
@@ -320,7 +320,8 @@ class LimbFuser:
             if estimate.gimbal and FrameFlag.GIMBAL not in flags:
                 flags.append(FrameFlag.GIMBAL)
             angles, included, main_sd, gimbal = estimate
-            measured = angles if proximal.used and distal.used else None  # no rate if held
+            # The angles of a held segment have no rate.
+            measured = angles if proximal.used and distal.used else None
             rates = self._rates.update(t_ns, name, measured, gimbal=gimbal)
             joints.append(
                 JointState(

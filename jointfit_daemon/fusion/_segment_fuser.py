@@ -5,10 +5,11 @@ Otherwise it is the mean of these sensors. Without sensors it is the last orient
 then None. If the set of sensors changes, the output moves from the old to the new orientation
 within 0.25 s:
 
-- If a sensor returns, both sets have data, and their predictions are blended. The first sample of a
-  returning sensor is often wrong, but its frame has a small weight.
-- If a sensor is lost, the difference between both sets in the previous frames is faded out. The
-  last frame is ignored if its difference contradicts the frames before.
+- If a sensor returns, all sensors of the old set and of the new set have data, and the predictions
+  of the two sets are blended. The first sample of a returning sensor is often wrong, but the frame
+  of this sample has a small weight.
+- If a sensor is lost, the difference between the predictions of the two sets in the previous frames
+  is faded out. The difference in the last frame is ignored if it contradicts the frames before.
 
 Invariant: every degradation sets a flag. The orientation jumps only in the frame after a wrong
 sample.
@@ -160,7 +161,7 @@ class SegmentFuser:
         """
         before = self._before
         if before is not None and inputs.keys() == before[2].keys():
-            alive, near, _ = before  # the usual case, without new tuples
+            alive, near, _ = before  # in this usual case, no new tuples are created
         else:
             alive, near = _present(self._sensors, inputs), _present(tuple(neighbor), inputs)
         if not alive:

@@ -227,8 +227,8 @@ class PatentReading(NamedTuple):
     joint: float
     """Joint angle of the patent, pi - abs(alpha), rad."""
     gimbal: bool
-    """Whether the frame is gimbal-locked. Beta is then close to 90 degrees, and alpha contains the
-    rotation.
+    """Whether the frame is gimbal-locked. Beta is then close to 90 or -90 degrees, and alpha
+    contains the whole rotation about the axes of alpha and gamma, which coincide.
     """
 
 

@@ -69,7 +69,8 @@ def branch_runs(chain: Chain) -> list[list[int]]:
 def body_parts(chain: Chain) -> list[str | None]:
     """Return the proximal body part, all segments, and the body parts distal to the chain's ends.
 
-    `joint_parts` relates the body parts to the joints.
+    A body part that the rig does not name is None. `joint_parts` relates the body parts to the
+    joints.
     """
     return [chain.proximal, *chain.segments, *(chain.distals or (chain.distal,))]
 
@@ -86,9 +87,11 @@ def is_left(chain: Chain, joint: int) -> bool:
 
 
 def neighbor(chain: Chain, i: int) -> tuple[str, ...]:
-    """Return the sensors of the segment distal to segment i, or else of its proximal segment.
+    """Return the sensors of the neighboring segment that a model of segment i may use.
 
-    If two segments are distal to segment i, the segment of the first branch is used.
+    The neighbor is the segment distal to segment i, or the segment of the first branch if two
+    segments are distal. If no segment is distal, the neighbor is the proximal segment. A single
+    segment has no neighbor, and the result is empty.
     """
     following = [joint for joint in distal_joints(chain, i) if joint < len(chain.segments)]
     if following:

@@ -317,7 +317,7 @@ class LabelSearch:
         most_hidden = int((~seen[own]).sum()) + 1
         found: Rows = np.zeros((1, 0), dtype=np.intp)
         for s in range(len(own)):
-            # The next marker gets every label, or none.
+            # Extend every assignment by the next marker, with each label and without a label.
             grown = np.column_stack(
                 (np.repeat(found, len(options), axis=0), np.tile(options, len(found)))
             )
@@ -526,13 +526,13 @@ def _combine(
 ) -> Generator[None, None, list[tuple[int, ...]] | None]:
     """Return the assignments with the least cost in which no label is used twice.
 
-    The result is None if no label is changed, or if the cost of another combination is almost as
-    low.
+    The result is None if no label is changed, if the cost of another combination is almost as low,
+    or if there are more than `_MOST_COMBINED` partial combinations.
     """
     # Each mask contains the columns of an assignment as bits.
     masks = [[sum(1 << c for c in one.columns if c >= 0) for one in each] for each in options]
     orders = [np.argsort([-one.cost for one in each]).tolist() for each in options]
-    rest = [0.0]  # least cost of the clusters without assignment
+    rest = [0.0]  # least cost of the clusters that have no assignment yet
     for each in reversed(options):
         rest.append(rest[-1] + min(one.cost for one in each))
     rest.reverse()
@@ -564,7 +564,7 @@ def _combine(
             continue
         stack += [
             (cost + options[p][i].cost, taken | masks[p][i], (*chosen, i))
-            for i in orders[p]  # the last, with the least cost, is visited first
+            for i in orders[p]  # the assignment with the least cost is last and is visited first
             if not taken & masks[p][i]
         ]
     close = [chosen for cost, chosen in sorted(found) if cost <= best + _MARGIN]

@@ -71,7 +71,8 @@ class SensorLink:
         Parameters
         ----------
         up_a, up_near : Vector
-            Vertical in the frames of the two segments; `up_near` is None if unknown.
+            Vertical in the frames of the two segments; `up_near` is None if unknown. The expected
+            components are then 0.
         """
         if up_near is None:
             return (0.0,) * len(self.weights), self.total + self.spread

@@ -129,7 +129,7 @@ class FrameLatency:
     def mark_fused(self, deadline_ns: int | None) -> None:
         """Count the latency of a frame up to the fusion.
 
-        The latency begins at `deadline_ns`, or without it at the arrival of the last chunk.
+        The latency begins at `deadline_ns` or, if this is None, at the arrival of the last chunk.
         """
         found, fused_ns = self._histograms, self._clock()
         if deadline_ns is None:

@@ -139,7 +139,7 @@ def _calibration(base: str) -> Iterator[tuple[str, dict[str, Any]]]:
 def _problems(rig: Rig) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield a binary sensor of class ``problem`` for each device.
 
-    The sensor is on if the device is disconnected, silent or stuck.
+    The binary sensor is on if the device is disconnected, silent or stuck.
     """
     for source in rig.sources:
         device = f"value_json.devices[{json.dumps(source.id)}]"  # escaped as in Jinja templates

@@ -99,7 +99,7 @@ class PhysicalTest:
                 self.rests.append(rest)
 
     def result(self) -> PhysicalTestResult:
-        """Evaluate the complete test. This decodes all chunks once for each setting to try."""
+        """Evaluate the complete test. All chunks are decoded once for each setting to try."""
         return evaluate_recording(self.source, self._chunks, self.rests)
 
 

@@ -313,8 +313,8 @@ class Core:
         outputs = self._process(event.source, state, items)
 
         # After the process was delayed, samples of other sources may still be in the kernel.
-        # Deadlines are therefore applied only at other events, such as a Tick, which follows after
-        # all available data were read.
+        # A chunk therefore applies no deadlines. All other events apply them, such as a Tick, which
+        # follows after all available data were read.
         return outputs + self._advance(complete_only=True)
 
     def _process(
@@ -329,7 +329,7 @@ class Core:
                 outputs += self._report(source, state, item)
                 continue
 
-            if state.open and not state.online:  # not for the last output of a closed decoder
+            if state.open and not state.online:  # the last output of a closed decoder has no effect
                 state.online = True
                 outputs.append(DeviceStatus(source, online=True))
                 outputs.append(Notice(self._now_ns, NoticeKind.DEVICE, source, "streaming"))

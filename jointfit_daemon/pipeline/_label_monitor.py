@@ -94,8 +94,7 @@ class LabelMonitor:
         self._hidden: NDArray[np.intp] = np.zeros(0, dtype=np.intp)
         """Columns of the mocap layout whose labels are faulty."""
         self.faults: dict[LabelFault, frozenset[str]] = {}
-        """Current faults, each with the body parts whose markers must be visible before it can end.
-        """
+        """Current faults, each with the body parts that must be visible before its end."""
         self.misfits: frozenset[str] = frozenset()
         """Body parts whose markers do not fit for a reason that no fault in `faults` explains."""
 

@@ -1,4 +1,7 @@
-"""Distribution of mocap frames to calibration, lag monitoring, online learning and joint center O1.
+"""Distribution of mocap frames to their consumers.
+
+The consumers are the calibration, the lag monitor, online learning, and the computation of O1, the
+center of the first joint.
 
 Invariant: every frame is counted once, as used or idle. Only live frames are used. Frames are
 combined with sensor data only if their stamp is synchronized to the host clock.
@@ -31,8 +34,8 @@ class MocapRouter:
         self._locator: OpticalOrigin | None = None
         self._origin: Vector | None = None
         self._unlocated: MocapFrame | None = None
-        """Last frame, until O1 is requested. O1 is computed on request, because the rate of the
-        cameras may exceed the rate of the limb states."""
+        """Last frame, which is stored until O1 is requested. O1 is computed on request, because the
+        rate of the cameras may exceed the rate of the limb states."""
 
     @property
     def origin(self) -> Vector | None:

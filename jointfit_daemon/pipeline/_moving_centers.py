@@ -46,8 +46,8 @@ nearly equals a row of the other, the two rows have one large and one small sing
 class MovingCenters:
     r"""Estimates the center of every joint from the last frames, and tests its shift.
 
-    A frame at time t_k has the weight :math:`e^{-(t - t_k)/T}`. The shift δ between running and
-    calibrated center is tested with the covariances C of both centers,
+    At the time t, a frame of the time t_k has the weight :math:`e^{-(t - t_k)/T}`. The shift δ
+    between running and calibrated center is tested with the covariances C of both centers,
 
     .. math:: D^2 = \delta^T (C + C_{calibrated})^{-1} \delta \sim \chi^2_r,
 

@@ -1,8 +1,9 @@
 """Rate limit for notices about wires and clocks: one per minute, device and kind.
 
-A condition is reported when it begins. While it lasts, its totals are reported once a minute. If it
-lasted for more than one report, its end is reported after a minute without the condition. The
-notice is a warning if the lost samples exceed the share `MOST_LOST` of the samples in a minute.
+A condition is reported when it begins. While it lasts, its totals are reported once a minute. If
+lost samples or corrupt bytes were reported more than once, their end is reported after a minute
+without them. A notice of lost samples is a warning only if they exceed the share `MOST_LOST` of the
+samples in a minute. Notices of corrupt bytes and of clock events are always warnings.
 
 Invariant: the sum of the totals in all notices equals the total number of events.
 """
@@ -37,13 +38,13 @@ _NO_DATA: Mapping[str, object] = MappingProxyType({})
 class _Condition:
     reported_ns: int
     rate_hz: float
-    """Sample rate of the device."""
+    """Sample rate of the device, Hz."""
     count: int = 0
     amount: int = 0
     """Number of lost samples or discarded bytes."""
     lasting: bool = False
-    """Whether the condition was reported more than once. In this case its end is reported as
-    well."""
+    """Whether lost samples or corrupt bytes were reported more than once. In this case their end is
+    reported as well."""
     text: str = ""
     data: Mapping[str, object] = field(default_factory=dict)
 
@@ -143,6 +144,6 @@ def unix_step_notices(now_ns: int, step_ns: int) -> list[Notice]:
         return []
     step_s = step_ns / 1e9
     text = f"UNIX time of this host was set back by {-step_s:.3f} s"
-    if step_s > 0:  # CLOCK_MONOTONIC stops while suspended
+    if step_s > 0:  # CLOCK_MONOTONIC stops while the host is suspended
         text = f"UNIX time was set forward by {step_s:.3f} s, or the host was suspended that long"
     return [Notice(now_ns, NoticeKind.CLOCK, "host", text, NoticeLevel.WARNING, {"step_s": step_s})]

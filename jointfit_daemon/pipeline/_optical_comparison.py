@@ -50,7 +50,7 @@ class RunningRms:
 
     .. math:: \mathrm{rms}^2 = \frac{\sum_k w_k x_k^2}{\sum_k w_k}, \qquad w_k = e^{-(t - t_k) / T}
 
-    where x_k is the value that was added at t_k.
+    where x_k is the value that was added at t_k, and t is the time of the last value.
 
     Parameters
     ----------
@@ -131,7 +131,8 @@ class OpticalComparison:
     def _states_around(self, t_ns: int) -> tuple[LimbState, LimbState] | None:
         """Return the limb states before and after an instant.
 
-        The result is None if the states are too far apart or not synchronized.
+        The result is None if no stored state precedes the instant, or if the two states are too far
+        apart or not synchronized.
         """
         after = None
         for state in reversed(self._states):

@@ -104,7 +104,7 @@ class LagHealth:
     found_by: str | None
     """Method by which the calibration estimated the lag; None without such an estimate."""
     tracked: TrackedLag | None
-    """Lag estimated during operation."""
+    """Lag estimated during operation; None before the first estimate."""
     refused: str | None
     """Reason why the last window yielded no estimate of the lag; None if it yielded one."""
 

@@ -1,4 +1,4 @@
-"""Calibration from a recording: the recorded requests start the same phases, with new fits."""
+"""Calibration from a recording: the recorded phases are repeated, and their fits are recomputed."""
 
 from __future__ import annotations
 

@@ -179,7 +179,8 @@ class _ChangedRun:
                 if self._changes.rig is not None:
                     yield from self._finish_job(output, self._now_ns)
                 else:
-                    self._waiting = output  # the daemon has one worker: it drops the previous job
+                    # The daemon has one worker, and a new job replaces the waiting job.
+                    self._waiting = output
 
     def _finish_job(self, job: FitJob, t_ns: int) -> Iterator[tuple[Event, list[Output]]]:
         self._waiting = None

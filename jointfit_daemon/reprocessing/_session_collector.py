@@ -147,7 +147,7 @@ class SessionCollector:
         if not self._states_ns or state.t_ns > self._states_ns[-1]:
             self._states_ns.append(state.t_ns)
             self._modes.append(state.mode.value)
-            self._flags.append(intern(" ".join(state.flags)))  # most frames have the same flags
+            self._flags.append(intern(" ".join(state.flags)))  # equal texts share memory
         for segment in state.segments:
             self._segments.setdefault(segment.name, _Rows(5)).add(
                 state.t_ns, segment.q_world_segment or _UNKNOWN_Q, (_number(segment.sd),)

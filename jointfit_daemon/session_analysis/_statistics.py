@@ -52,7 +52,7 @@ class MotionRange:
 
     @property
     def extent_sd(self) -> float:
-        """Standard deviation of `extent` for independent errors at both ends, rad."""
+        """Standard deviation of `extent` for independent errors of minimum and maximum, rad."""
         return float(np.hypot(self.minimum_sd, self.maximum_sd))
 
 

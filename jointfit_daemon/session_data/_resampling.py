@@ -26,7 +26,7 @@ UNIFORM_SHARE = 0.01
 """Largest deviation of an instant from a uniform time axis, in sample periods."""
 _EXACT_SHARE = 1e-6
 """Largest distance between an instant and a row, in sample periods, at which the value of the row
-is returned without interpolation. A series with a single row counts as one with a period of 1 s.
+is returned without interpolation. A series with a single row is assigned a period of 1 s.
 """
 
 

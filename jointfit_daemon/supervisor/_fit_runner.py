@@ -32,7 +32,7 @@ FIT_TIMEOUT_S = 300.0
 """Longest duration of a fit, s. After this time the subject has probably removed the sensors."""
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 """Environment variables of the worker, which numpy reads on import. More threads would use the CPU
-core that processes the sensors. They are also slower on small matrices; a fit can take 11 s
+core that processes the sensors. More threads are also slower on small matrices: a fit can take 11 s
 instead of 1 s."""
 _LONGEST_LINE = 256 * 1024 * 1024
 """Size of the largest result, bytes. A calibration of four sensors has about 1 MB."""

@@ -90,9 +90,9 @@ def lock_again(directory: Path) -> int | None:
 
 
 def make_private(directory: Path) -> None:
-    """Remove the permissions of group and others from files that earlier daemons created.
+    """Remove the permissions of group and others from files and folders that daemons created.
 
-    Only files of this user in the daemon's folders are changed.
+    Files and folders of other users are not changed.
     """
     for path in _owned_paths(directory):
         try:

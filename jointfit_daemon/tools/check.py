@@ -87,7 +87,7 @@ def _calibration_lines(sources: Iterable[Source]) -> Iterator[str]:
 
 
 def _rate(source: Source) -> str:
-    """Return the configured rate as text; cameras without the key `rate_hz` set their rate."""
+    """Return the configured rate as text; ``its own`` if cameras have no key ``rate_hz``."""
     if source.kind == "mocap" and not hasattr(source.settings, "rate_hz"):
         return "its own"
     return f"{source.rate_hz:g} Hz"

@@ -132,7 +132,7 @@ class Simulator(ChildProcess):
         return answer
 
     async def quit(self) -> dict[str, Any]:
-        """Stop the streams; return the number of samples sent."""
+        """Stop the streams; return the reply with the numbers of sent samples."""
         await self.send_command("quit")
         async with time_limit(STOP_S, "the end of the simulator"):
             while True:

@@ -85,7 +85,7 @@ class CommandGroup(TyperGroup):
 
     @override
     def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
-        """Return the completions without blanks; a shell would split the others."""
+        """Return the completions that contain no blank; a shell would split other completions."""
         found = super().shell_complete(ctx, incomplete)
         return [item for item in found if " " not in item.value]
 
@@ -120,8 +120,8 @@ class CommandGroup(TyperGroup):
 
 
 def _known_error(error: Exception) -> tuple[int, str] | None:
-    """Return exit code and message of an error that is not a bug."""
-    if isinstance(error, BrokenPipeError):  # as in `jointfit schema | head`; typer prints nothing
+    """Return exit code and message of an error that a user can correct; None for other errors."""
+    if isinstance(error, BrokenPipeError):  # `jointfit schema | head` is no error for the user
         return None
     if isinstance(error, OSError) and error.filename is not None:
         return EXIT_MISUSE, os_error_text(error)

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chunk, Decoded
 
 MOST_SHOWN = 8
-"""Maximum number of identifiers that a message lists."""
+"""Maximum number of identifiers that an error message lists."""
 SHOWN = 60
-"""Maximum number of characters of a setting quoted in a message."""
+"""Maximum number of characters of a setting that an error message quotes."""
 
 
 @dataclass(slots=True)

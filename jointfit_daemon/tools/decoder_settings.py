@@ -31,9 +31,9 @@ def decoder_settings(driver: type[Driver], name: str, given: Mapping[str, Any]) 
             if CanBusSettings in models:
                 table[key] = {"interface": "virtual", "channel": "file"}
             elif get_origin(info.annotation) is Literal and 1 not in get_args(info.annotation):
-                continue  # no placeholder, so the validation reports the key
+                continue  # without a placeholder, the validation reports the missing key
             elif not models and get_origin(info.annotation) is not dict:
-                # The key is a single value. Tables have no placeholder.
+                # The value is a text or a number. For a table, there is no placeholder.
                 table[key] = "file" if str in kinds else 1
     try:
         return driver.Settings.model_validate(table)

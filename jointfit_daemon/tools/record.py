@@ -28,7 +28,7 @@ def record(
         bool, typer.Option("--json", help="Print the whole answer as one JSON object.")
     ] = False,
 ) -> None:
-    """Start or stop the recording of a running daemon, or label this instant in it.
+    """Start or stop the recording of a running daemon, or label this instant in the recording.
 
     Exit codes: as for `jointfit request`.
     """

@@ -1,8 +1,8 @@
 """Options for the compiler mypyc, in modules that it may compile.
 
 mypyc reads the decorators of mypy_extensions in the source and never runs them, so an installation
-does not need mypy_extensions. This module itself is not compiled, because mypyc regards its second
-branch as unreachable.
+does not need mypy_extensions. This module itself is not compiled, because mypyc regards the branch
+after ``else`` as unreachable.
 """
 
 from __future__ import annotations

@@ -124,7 +124,8 @@ class OrientationGate:
     def misconfigured_norm(self) -> float | None:
         """Median norm if more than 90 of the first 100 samples were rejected; None otherwise.
 
-        In this case byte order or scale are wrong. The value is NaN if no norm was finite.
+        If more than 90 were rejected, byte order or scale is wrong. The value is NaN if no norm was
+        finite.
         """
         if self._checked < _CHECKED or self._rejected <= _MOST_REJECTED:
             return None

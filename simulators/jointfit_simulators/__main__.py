@@ -204,7 +204,7 @@ def _subject(options: argparse.Namespace, knobs: Knobs) -> InstrumentedSubject:
 
 
 def _pairs(option: str, words: Sequence[str]) -> list[tuple[str, str]]:
-    """Split arguments of the form ``A=B``; raise ValueError for other forms."""
+    """Return both parts of arguments ``A=B``; raise ValueError for other forms."""
     parts = [word.partition("=") for word in words]
     if wrong := [a for a, equals, _ in parts if not equals]:
         raise ValueError(f"{option} {wrong[0]}: expected two parts, A=B: see --help")
@@ -255,7 +255,7 @@ async def _run_commands(scene: Scene) -> None:
         transport, _ = await asyncio.get_running_loop().connect_read_pipe(
             lambda: asyncio.StreamReaderProtocol(reader), sys.stdin
         )
-    except (ValueError, OSError):  # stdin is a plain file or /dev/null, which is not read
+    except (ValueError, OSError):  # a plain file or /dev/null is not read
         return
 
     try:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.driver import Driver
 
 _LATER = 5
-"""Number of samples for a decoder that starts later."""
+"""Number of samples that the decoder which starts later must return."""
 
 
 class LateStartContract:

@@ -240,7 +240,7 @@ class DriverContract(LateStartContract, ABC):
         asyncio.run(scene())
 
     def test_arrival_stamps_are_those_of_the_first_byte(self, tmp_path: Path) -> None:
-        """On a busy host, the arrival of a message is computed from the bytes that follow it."""
+        """The arrival time of a message follows from the number of later bytes in its chunk."""
 
         async def scene() -> None:
             driver, data, t_ns, _ = await self._record(tmp_path)
@@ -541,7 +541,7 @@ class DriverContract(LateStartContract, ABC):
     async def _send_all(
         self, device: Any, receiver: DecodingReceiver, first: int, count: int
     ) -> range:
-        """Send `count` samples and wait for all of them."""
+        """Send `count` samples and wait for all of them; return their numbers."""
         before = len(receiver.measurements)
         for number in range(first, first + count):
             self.send(device, number)

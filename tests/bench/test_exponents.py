@@ -1,4 +1,4 @@
-"""Exponents of growing costs, and their drawing."""
+"""Growth exponents of costs are estimated independently of a fixed cost."""
 
 from __future__ import annotations
 

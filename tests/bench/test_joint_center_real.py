@@ -1,4 +1,4 @@
-"""Joint centers of a recorded trial; the test needs the recordings and OpenSim."""
+"""Predicted errors of the joint centers of a recorded trial are large enough (needs OpenSim)."""
 
 from __future__ import annotations
 

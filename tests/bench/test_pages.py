@@ -1,4 +1,4 @@
-"""Pages of docs that are generated from the committed results."""
+"""The committed pages of docs equal the text that is generated from the committed results."""
 
 from __future__ import annotations
 

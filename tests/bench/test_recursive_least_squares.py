@@ -1,4 +1,4 @@
-"""Recursive fits, compared with batch fits, and their limits during rest."""
+"""Recursive fits equal batch fits without forgetting, follow changes, and remain stable at rest."""
 
 from __future__ import annotations
 

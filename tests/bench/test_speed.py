@@ -1,4 +1,4 @@
-"""Speed experiments run as a command, and the command fails where a threshold is missed."""
+"""Speed experiments run as a command, and the command fails if a threshold is missed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every short experiment meets its thresholds, on the code that writes the committed results."""
+"""Every short experiment meets its thresholds, and every experiment has committed results."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ def test_trace_contains_the_lag_that_clocks_cannot_estimate() -> None:
     run, trace = watched()
     for name, windows in trace.lags.items():
         good = [w.estimate for w in windows if w.estimate.refused is None]
-        assert good or name == "S3"  # which reboots in the middle
+        assert good or name == "S3"  # S3 reboots in the middle of the run
         for estimate in good:
             truth_ns = run.lag_ns[name] - trace.latency_ns[name]
             assert abs(estimate.lag_ns - truth_ns) < 4 * estimate.sigma_ns + 50_000

@@ -1,7 +1,7 @@
-"""A leg of known geometry for tests, written with SciPy only and without code of the project.
+"""A leg of known geometry for tests. It is simulated with SciPy, without algorithms of the project.
 
-Segment frames are those of CONVENTIONS.md: x right, y forward, z up, origin at the proximal joint
-center.
+The segment axes are defined in CONVENTIONS.md: x points to the right, y forward, z up. The origin
+is the proximal joint center.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Subject:
 
 @dataclass(frozen=True)
 class Motion:
-    """True bones on a time grid."""
+    """True orientations and positions of the bones at the instants `t_s`."""
 
     t_s: Array
     q: dict[str, Rotation]
@@ -92,7 +92,7 @@ class Motion:
 
 
 def motion(subject: Subject, seconds: float, rate_hz: float, *, still: bool = False) -> Motion:
-    """Return walking, squats and hip circles one after another, with standing at both ends."""
+    """Return walking, squats and hip circles in turn, with standing at the start and the end."""
     t = np.arange(round(seconds * rate_hz)) / rate_hz
     calm = 0.0 if still else 1.0
     hip, adduction, turn, knee, ankle, sway = calm * _program(t, seconds)
@@ -115,7 +115,7 @@ def motion(subject: Subject, seconds: float, rate_hz: float, *, still: bool = Fa
 
 def _program(t: Array, seconds: float) -> Array:
     """Return hip flexion, adduction, rotation, knee and ankle flexion, sway, shape (6, n)."""
-    turns = np.floor(t / 5.0).astype(int) % 3  # five seconds of each kind in turn
+    turns = np.floor(t / 5.0).astype(int) % 3  # the kind of movement changes every five seconds
     edge = np.minimum(t, seconds - t)
     gate = np.clip(edge / 0.8, 0, 1)
     gate = gate**2 * (3 - 2 * gate)
@@ -137,7 +137,7 @@ def _program(t: Array, seconds: float) -> Array:
 def record(
     subject: Subject, truth: Motion, purpose: int, *, sensors: bool = True, cameras: bool = True
 ) -> CalibrationTrial:
-    """Record a motion given at a high rate: sensors at 100 Hz, cameras at 120 Hz."""
+    """Return the trial of a motion, with sensors at 100 Hz and cameras at 120 Hz."""
     tracks = _sensors(subject, truth, purpose) if sensors else {}
     return CalibrationTrial(tracks, _optical(subject, truth, purpose) if cameras else None)
 

@@ -1,4 +1,4 @@
-"""Every estimator by name: same center, same refusals, no NaN."""
+"""All estimators, called by name, find the same center, refuse the same data and return no NaN."""
 
 from __future__ import annotations
 
@@ -67,7 +67,8 @@ def test_bound_belongs_to_the_movement_not_to_the_method(name: str) -> None:
     points = 0.15 * np.stack((np.cos(turns), np.sin(turns)), axis=1) + noise
     found = estimate_center(Movement(points[:, None]), name)
     assert found.refused is None
-    # The errors of the methods differ by a factor of ten here; the stated noise hardly does.
+    # The errors of the methods differ by a factor of ten here, but the estimated noise hardly
+    # differs.
     least = circle_rms_bound(turns, found.noise)
     assert found.bound == pytest.approx(least, rel=0.15)
 
@@ -207,7 +208,7 @@ def test_the_batch_spheres_ellipse_covers(arc: float) -> None:
 def test_three_frames_predict_their_error_from_the_residuals_of_the_cameras() -> None:
     rng, angles = np.random.default_rng(5), np.linspace(0.0, np.radians(100.0), 60)
     occluded = np.abs(np.abs(angles - angles.mean()) - np.radians(25.0)) < np.radians(12.0)
-    sd = np.where(occluded, 2e-3, 0.5e-3)  # the frames at the ends and in the middle are good
+    sd = np.where(occluded, 2e-3, 0.5e-3)  # small at both ends and in the middle of the arc
     circle = 0.3 * np.stack((np.cos(angles), np.sin(angles)), axis=-1)[:, None]
     errors, stated, unstated = [], [], []
     for _ in range(200):

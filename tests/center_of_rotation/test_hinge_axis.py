@@ -1,4 +1,4 @@
-"""The stated uncertainty of a hinge's axis against repeated simulated movements."""
+"""Predicted standard deviation of a hinge axis, compared with repeated simulated movements."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ def turned(angle: Array, point: Any) -> Array:
 
 
 def planar_side(rng: np.random.Generator, noise: float) -> tuple[JointSide, Array]:
-    """Return a parent fitted to two noisy markers, its estimated joint, and the joint's truth."""
+    """Return one side of a planar joint with two noisy markers, and the true joint positions."""
     t = np.linspace(0.0, 1.0, FRAMES)
     angle, bend = 0.5 * np.sin(9.0 * t), 1.2 * np.sin(5.0 * t)
     at = np.stack((t, 0.3 * t), axis=1)

@@ -23,7 +23,7 @@ JOINTS = [
 
 @pytest.fixture
 def legs(table: Table) -> Table:
-    """Return a rig of two legs with one sensor a segment."""
+    """Return a rig of two legs with one sensor on each segment."""
     imu = table["imu"][0]
     table["chain"] = {"segments": list(SEGMENTS), "joint": [dict(joint) for joint in JOINTS]}
     table["imu"] = [
@@ -52,7 +52,7 @@ def test_two_legs_share_the_pelvis_in_any_order_of_the_tables(legs: Table) -> No
             given = next(each for each in JOINTS if each["name"] == joint)
             above = parent[joint]
             assert above is not None
-            assert above < number  # a segment follows the one that carries it
+            assert above < number  # a segment follows its proximal segment
             assert chain.segments[above] == given["parent"]
             assert chain.left_joints[number] == joint.startswith("left")
             if number < len(SEGMENTS):

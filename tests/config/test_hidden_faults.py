@@ -1,4 +1,4 @@
-"""A fault of rig.toml hides no other fault, and its message has no internals."""
+"""A fault of rig.toml hides no other fault, and its message contains no internal values."""
 
 from __future__ import annotations
 

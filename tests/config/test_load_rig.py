@@ -321,7 +321,7 @@ def test_file_names_are_relative_to_the_rig_file(
 def test_default_broker_is_an_address() -> None:
     example = tomllib.loads((PROJECT / "examples" / "knee.toml").read_text(encoding="utf-8"))
     for host in (MqttSettings().host, RigOptions().mqtt_host, example["mqtt"]["host"]):
-        assert ip_address(host).is_loopback  # /etc/hosts may lack the name
+        assert ip_address(host).is_loopback  # /etc/hosts may not contain "localhost"
 
 
 anything = st.recursive(

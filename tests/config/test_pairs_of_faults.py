@@ -170,7 +170,9 @@ def test_every_mistake_is_reported_alone(tmp_path: Path, subtests: pytest.Subtes
 
 
 UNREADABLE_SEGMENTS = "unclosed array"
-"""If the list of segments is unreadable, the texts in `NEED_SEGMENTS` cannot be reported."""
+"""Message of an unreadable list of segments. With this fault, messages that begin with a text in
+`NEED_SEGMENTS` cannot be reported.
+"""
 NEED_SEGMENTS = (
     "chain.proximal = 'shank'", "chain.lengths_m.thihg", "imu[S3].segment = 'shnak'",
     "expected 3 joints", "calibration.joint_center_methods.kene", "mocap.rigid_body.foot",
@@ -182,7 +184,7 @@ def test_no_mistake_hides_another(tmp_path: Path) -> None:
     for first, second in [*combinations(MISTAKES, 2)][:: 1 if ALL else 3]:
         changed = RIG.replace(first[0], first[1])
         if changed.count(second[0]) != 1 or first[0] in second[0] or second[0] in first[0]:
-            continue  # the same key
+            continue  # both mistakes concern the same key
         found = messages(tmp_path, changed.replace(second[0], second[1]))
         missing = [text for text in (first[2], second[2]) if text not in found]
         if UNREADABLE_SEGMENTS in (first[2], second[2]):

@@ -1,4 +1,4 @@
-"""A planar rig is followed by cameras alone, with one or two markers on a segment."""
+"""Planar rigs in rig.toml: cameras without sensors, and enough markers on every segment."""
 
 from __future__ import annotations
 

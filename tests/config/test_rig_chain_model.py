@@ -41,7 +41,7 @@ def model() -> Table:
 
 @pytest.fixture
 def rig(table: Table) -> Table:
-    """Return a rig with that model."""
+    """Return a rig with the chain model of the fixture `model`."""
     table["mocap"]["markers"] = {"thigh": ["T1", "T2", "T3"], "shank": ["C1", "C2", "C3"]}
     table["chain"]["model"] = model()
     return table
@@ -88,7 +88,7 @@ def test_model_is_read_from_a_file_beside_the_rig(fakes: object, tmp_path: Path)
     names = [name for one in loaded.chain_model.coordinates for name in one.names]
     assert names[-1] == "tibia_angle"
 
-    # the table has the content: a recording is sufficient for a replay
+    # the table contains the content of the model file, so a replay needs only the recording
     assert loaded.table["chain"]["model"] == as_data(loaded.chain_model.chain)
     again = parse_rig(loaded.table)
     assert again.chain_model is not None
@@ -255,7 +255,7 @@ def test_live_model_has_the_refined_markers_of_the_same_model_only(rig: Table) -
     assert tracker is not None
     assert tracker.loaded.chain.markers[0].position == (0.2, 0.0, 0.0)
     assert tracker.loaded.chain.markers[1:] == model.markers[1:]
-    assert chain_tracker(loaded, calibration, tracker) is tracker  # its monitor continues
+    assert chain_tracker(loaded, calibration, tracker) is tracker  # so its marker monitor continues
 
     core = Core()
     assert not [one for one in core.feed(Configured(0, loaded, calibration)) if warned(one)]

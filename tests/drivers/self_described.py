@@ -1,4 +1,4 @@
-"""Tables of self-described devices, and virtual devices that send what they describe."""
+"""Tables of self-described devices, and virtual devices that send what the tables describe."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def device_options(
     """Return the options of a device that sends what a table describes."""
     fields = settings.places().fields
     if isinstance(settings, SerialTableSettings) and settings.text is not None:
-        for name in ("time", "counter"):  # whole numbers, as a sketch prints them
+        for name in ("time", "counter"):  # whole numbers, as an Arduino program prints them
             (slot,) = SLOTS[name]
             if slot in fields:
                 fields[slot] = fields[slot]._replace(kind="u")

@@ -29,7 +29,7 @@ EPOCH = 1_000 * S
 
 
 class ArrivalHost:
-    """Two clocks; a reading takes 40 ns. The wall clock is stepped at a given time."""
+    """Host with two clocks. A clock reading takes 40 ns. The wall clock steps at a given time."""
 
     def __init__(self, step_at_ns: int, step_ns: int) -> None:
         self.now, self._step_at, self._step = EPOCH, step_at_ns, step_ns
@@ -106,12 +106,12 @@ def test_arrival_stamps_are_never_in_the_future() -> None:
 
 @pytest.mark.alone
 def test_stamps_are_the_kernels_however_busy_the_loop_is() -> None:
-    """Bench tests the target of 0.1 ms for 99 %; these limits are for a loaded machine."""
+    """An experiment tests the target of 0.1 ms for 99 %. These limits allow a loaded machine."""
     stamped, read = delays_ns(200)
     assert min(stamped) > -50_000
     assert sorted(stamped)[len(stamped) // 2] < 150_000
     assert sorted(stamped)[int(0.9 * len(stamped))] < 1_000_000
-    assert sorted(read)[int(0.9 * len(read))] > 1_000_000  # the time of the read
+    assert sorted(read)[int(0.9 * len(read))] > 1_000_000  # stamps at the read are late
 
 
 # --- lines ------------------------------------------------------------------------------------

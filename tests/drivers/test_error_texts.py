@@ -1,4 +1,4 @@
-"""Every error of a driver states a remedy, without the id, which the log line starts with."""
+"""Error texts of drivers contain a remedy, but not the id with which the log line starts."""
 
 from __future__ import annotations
 

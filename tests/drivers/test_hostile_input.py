@@ -43,7 +43,7 @@ def through_clock(decoder: Decoder, chunks: list[Chunk]) -> None:
 
 @st.composite
 def xbus_messages(draw: st.DrawFn) -> bytes:
-    """Return a message with any values, runs of equal ones among them."""
+    """Return a message with any values, including runs of equal values."""
     items: list[tuple[int, Any]] = []
     if draw(st.booleans()):
         items.append((Item.PACKET_COUNTER, draw(SMALL_STEPS | U16)))

@@ -48,7 +48,7 @@ def mip_info(firmware: int) -> DeviceInformation:
 
 
 class Newer(NamedTuple):
-    """One family with a newer device."""
+    """One device family, with the messages of a newer device."""
 
     driver: str
     make: Callable[[Path, WireNoise], Any]
@@ -57,7 +57,7 @@ class Newer(NamedTuple):
     named: str
     """Name of the unknown message in the warning."""
     version: str | None
-    """Version that the device reports; None for a family without one."""
+    """Version that the device reports; None for a family without version."""
     keys: Any = {}  # noqa: RUF012 - never changed
 
 
@@ -202,7 +202,7 @@ def test_corrupt_messages_that_pass_a_checksum_are_not_reported() -> None:
     ], "less often than ten times a minute"
     assert not newer.take_version("1.99.3")
     assert not newer.take_version("unknown")
-    for k in range(1000):  # bounded
+    for k in range(1000):  # only a bounded number is stored
         newer.take_unknown(f"message {k}", 0)
     assert len(newer._seen) <= 16
 

@@ -32,7 +32,7 @@ SEEDS = range(5)
 
 
 class NoisyRun(NamedTuple):
-    """What a decoder and the clock behind it reported of one run."""
+    """Numbers of samples, lost samples and restarts of one run."""
 
     received: int
     lost: int

@@ -13,7 +13,7 @@ OLD = encode(0x80, ((0x04, bytes(12)),))
 
 
 class ScriptedPort:
-    """Port that receives the given chunks, None for a pause."""
+    """Port that receives the given chunks; None is a pause."""
 
     path = "port"
 

@@ -1,4 +1,4 @@
-"""Parts that decoders of driver packages share: checks of samples, serial and CAN decoder bases."""
+"""Parts that decoders share: checks of samples, and bases of serial and CAN decoders."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 MS = 1_000_000
 CLOCK = TickClock(tick_ns=125_000, modulus=1 << 32)
 PERIOD = 80
-"""Ticks of 125 us in 10 ms."""
+"""Sample period of 10 ms, in ticks of 125 us."""
 
 
 def sample(number: int, *, ticks: int | None = None, norm: float = 1.0) -> ImuSample:

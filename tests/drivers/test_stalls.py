@@ -1,4 +1,4 @@
-"""A stalled sender or receiver is a delay or a pause of the device, and never its restart."""
+"""A stall of a sender or receiver counts as a delay or a pause, never as a restart."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_a_port_reopened_during_a_stall_shows_no_restart(
     buffered: int,
 ) -> None:
     stream = paused_sender(start, stall_ms, buffered, 0)
-    assert restarts(stream[BEFORE:]) == 0  # it begins with the late messages
+    assert restarts(stream[BEFORE:]) == 0  # the reopened port begins with late messages
 
 
 @FAMILIES
@@ -132,7 +132,7 @@ def test_a_backlog_of_a_stalled_receiver_is_a_delay_and_no_restart(
     uncounted: bool,
 ) -> None:
     missed = stall_ms * 1_000_000 // PERIOD_NS
-    resets = max(missed - kept, 0) if uncounted else 0  # the counter stands while messages are lost
+    resets = max(missed - kept, 0) if uncounted else 0  # the counter pauses while messages are lost
     if resets and missed < 25:
         return
     assert restarts(stalled_receiver(start, stall_ms, kept, resets)) == 0

@@ -1,9 +1,9 @@
-"""``make endurance``: the daemon process in time that runs faster than real time, for many samples.
+"""``make endurance``: runs the daemon process in accelerated time, for many samples.
 
 Four simulated sensors on serial lines, broker, daemon and listener run as in operation. The time of
 the daemon and of the sensors is accelerated. Memory, file descriptors, threads, tasks, Python
-objects, the age of poses, their error and the clocks of the sensors are measured at even intervals.
-The command returns 1 if one of them has a slope, or if poses, clocks or counters are wrong.
+objects, the age of samples, the error of poses and the clock skew are measured at even intervals.
+The command returns 1 if one of these values has a slope, or if poses, clocks or counters are wrong.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ silence_s = {silence_s}
 
 
 def error_deg(pose: dict[str, Any], movement: Movement, unix_ns: int) -> float | None:
-    """Return the error of a pose; None without an orientation. The movement begins at `unix_ns`."""
+    """Return the error of a pose, deg, for a movement since `unix_ns`; None if it is unknown."""
     q = pose["segments"]["thigh"]["q"]
     if q is None:
         return None
@@ -147,8 +147,8 @@ def variant_of(child: ChildProcess) -> str:
 def write_rig(folder: Path, port: int, factor: int) -> None:
     """Write rig.toml and a calibration of its chain."""
     text = RIG.format(port=port, base=BASE, folder=folder, health_s=5)
-    # The time limit is a second of real time, because this machine pauses processes for tenths of a
-    # second.
+    # The limit `silence_s` is one second of real time, because this machine pauses processes for
+    # tenths of a second.
     line = {"folder": folder, "rate_hz": RATE_HZ, "silence_s": factor}
     text += "".join(IMU.format(name=name, **line) for name in SENSORS)
     (folder / "rig.toml").write_text(text, "utf-8")
@@ -196,7 +196,7 @@ async def measure(
                 row = {"samples": float(received(listener))}
                 row |= process_values(child.process.pid, folder / "counts")
                 row |= daemon_values(listener, movement, unix_ns)
-                if not any(map(math.isnan, row.values())):  # NaN: this machine paused
+                if not any(map(math.isnan, row.values())):  # NaN: no pose or no clock
                     found.append(row)
                     append(row, options.out)
     finally:
@@ -252,9 +252,9 @@ def main() -> int:
     """Run the test; return 1 if a value has a slope or is wrong."""
     parser = argparse.ArgumentParser(prog="make endurance", description=__doc__)
     parser.add_argument("--samples", type=int, default=50_000_000, help="samples of all sensors")
-    parser.add_argument("--factor", type=int, default=10, help="times real time")
-    parser.add_argument("--minutes", type=float, default=600.0, help="longest real time")
-    parser.add_argument("--compiled", action="store_true", help="the modules of `make compiled`")
+    parser.add_argument("--factor", type=int, default=10, help="speed of the accelerated time")
+    parser.add_argument("--minutes", type=float, default=600.0, help="limit of the real time")
+    parser.add_argument("--compiled", action="store_true", help="use the compiled modules")
     parser.add_argument("--out", type=Path, help="file for the measurements, JSON lines")
     parser.add_argument("--store", action="store_true", help="store the slopes for the page")
     options = parser.parse_args()

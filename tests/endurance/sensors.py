@@ -1,8 +1,8 @@
 """Process with the four sensors of ``make endurance``, which move in accelerated time.
 
 At each wake-up, a sensor sends all due samples in one write. A message is encoded once for all
-sensors with the same outputs. Samples that were due more than `BATCH` samples ago are skipped, as
-those of a real sensor while its host is paused.
+sensors with the same output configuration. Samples that were due more than `BATCH` samples ago are
+skipped, like the samples of a real sensor while its host is paused.
 
 Invariant: a machine too slow for the factor ends the process with an error; it never blocks the
 event loop.
@@ -46,7 +46,7 @@ class TooSlowError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Movement:
-    """Accelerated time, and the angle of all sensors as a function of it."""
+    """Accelerated time, and the angle of all sensors as a function of this time."""
 
     factor: int
     begin_ns: int = field(default_factory=time.monotonic_ns)
@@ -63,7 +63,7 @@ class Movement:
         return RATE_HZ * len(SENSORS) * self.factor
 
     def angle(self, elapsed_ns: int) -> float:
-        """Return the angle at an accelerated time after the begin, rad."""
+        """Return the angle, rad, `elapsed_ns` of accelerated time after the start."""
         return math.sin(TURN_RAD_S * elapsed_ns * 1e-9)
 
 
@@ -71,7 +71,7 @@ class BatchDevice(XbusDevice):
     """Device that sends messages which were encoded before."""
 
     def message(self, number: int, angle: float) -> bytes:
-        """Return the message of a sample with the current outputs of this device."""
+        """Return the message of a sample in the output configuration of this device."""
         ticks = self._ticks(number * PERIOD_NS) % self._modulus
         q = (math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0)
         return encode(XbusMessageId.MT_DATA2, self._content(number % (1 << 16), ticks, q, {}))

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 RESULTS = Path(__file__).parent / "results.json"
 ERROR = "median error of poses, deg"
 MOST_ERROR_DEG = 3.0
-"""Largest median error of an interval, deg. A batch of samples arrives late by its duration."""
+"""Largest median pose error of an interval, deg. It includes the movement during the wait of a
+sample for the rest of its batch."""
 MOST_MISSING = 0.01
 """Largest share of samples that are lost or dropped. A larger share shows that the daemon is too
 slow for the factor, so the run has not tested normal operation."""
@@ -44,7 +45,7 @@ class Slope:
     per_million: float
     """Slope, units per million samples."""
     half_width: float
-    """Half width of the interval of the slope."""
+    """Half width of the confidence interval of the slope, same unit."""
     mean: float
 
     @property
@@ -66,7 +67,7 @@ def slope_of(samples: ArrayLike, values: ArrayLike, quantities: int) -> Slope:
     Raises
     ------
     ValueError
-        Fewer values than two for each block.
+        There are fewer than two values for each block.
     """
     x, y = np.asarray(samples, dtype=float) / 1e6, np.asarray(values, dtype=float)
     late = x >= x[0] + WARM_UP * (x[-1] - x[0])

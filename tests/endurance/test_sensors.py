@@ -42,7 +42,7 @@ def sensors(tmp_path: Path) -> Iterator[Sensors]:
 
 @pytest.fixture
 def lines(sensors: Sensors, tmp_path: Path) -> Iterator[list[int]]:
-    del sensors  # it creates the lines
+    del sensors  # this fixture creates the lines
     opened = [os.open(tmp_path / name, os.O_RDWR | os.O_NOCTTY) for name in SENSORS]
     yield opened
     for fd in opened:

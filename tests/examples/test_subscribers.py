@@ -38,7 +38,7 @@ def test_a_subscriber_is_short(file: Path) -> None:
 
 @pytest.mark.system
 async def test_the_python_subscriber_prints_the_flexion(broker: Broker) -> None:
-    port = broker.port_of("3.1.1")  # version of the library's default
+    port = broker.port_of("3.1.1")  # default version of aiomqtt
     async with live_rig(port, "3.1.1"):
         shown = await first_line(sys.executable, SUBSCRIBERS / "knee.py", "127.0.0.1", str(port))
     assert shown == SHOWN

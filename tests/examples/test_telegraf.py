@@ -1,6 +1,6 @@
 """The Telegraf configuration reads what the daemon writes.
 
-Telegraf itself is not in Debian: its rules of topics and JSON paths are evaluated here.
+Telegraf is not in Debian, so these tests evaluate its rules of topics and JSON paths themselves.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ OPTIONS: dict[str, set[str]] = {
     },
     "influxdb_v2": {"urls", "token", "organization", "bucket"},
 }  # fmt: skip
-"""Options of the tables, from the documentation of Telegraf: it ends at start if one is unknown."""
+"""Options of the tables, from the documentation of Telegraf. With an unknown option, Telegraf does
+not start."""
 
 
 def inputs() -> dict[str, dict[str, Any]]:

@@ -75,7 +75,7 @@ class FaultyLink:
 
 @contextlib.asynccontextmanager
 async def faulty_link(gateway: Gateway) -> AsyncIterator[FaultyLink]:
-    """Replace the broker by the proxy, at first without a fault; remove the proxy at the end."""
+    """Yield a proxy without a fault, which replaces the broker until the end of the block."""
     behind = chosen_broker()(gateway.folder)
     gateway.broker.stop()
     behind.start()

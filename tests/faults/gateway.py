@@ -1,8 +1,8 @@
 """Gateways for fault scenarios: simulated devices, broker, daemon and listener.
 
-Three gateways exist. The first has two serial sensors. The second also has a sensor on CAN and
-cameras. The third runs in a mount namespace with a small disk for recordings, a clock that can be
-stepped, and writes that can be delayed.
+Three kinds of gateways exist. The kind ``serial`` has two serial sensors. The kind ``all`` also has
+a sensor on CAN and cameras. The kind ``host`` has two serial sensors, and runs in a mount namespace
+with a small disk for recordings, a clock that can be stepped, and writes that can be delayed.
 """
 
 from __future__ import annotations
@@ -217,7 +217,7 @@ class Gateway:
         return ("S1", "S2", "S3") if self.kind == "all" else ("S1", "S2")
 
     def inject(self, step_s: float = 0.0, write_s: float = 0.0) -> None:
-        """Step UNIX time in the daemon by `step_s`, and delay its durable writes by `write_s`."""
+        """Set the step of UNIX time and the delay of durable writes in the daemon, both in s."""
         path = self.folder / "injected"
         path.touch()
         with path.open("r+b") as file:
@@ -280,7 +280,7 @@ class Gateway:
             self.broker.start()
 
     async def logged(self, text: str, since: int = 0) -> float:
-        """Wait for a text in the log after its first `since` characters; return the time, s."""
+        """Wait for a text in the log after `since` characters; return the elapsed time, s."""
         return await self.seconds(lambda: text in self.log[since:])
 
     async def device(self, name: str) -> dict[str, Any]:
@@ -337,7 +337,7 @@ class Gateway:
         return time.monotonic() - began_s
 
     async def link_dropped(self) -> float:
-        """Wait until the daemon drops a message to the broker; return the time, s."""
+        """Wait until the daemon drops a message to the broker; return the elapsed time, s."""
         began_s, name = time.monotonic(), b"\njointfit_mqtt_dropped_messages_total "
 
         async def dropped() -> int:
@@ -350,7 +350,7 @@ class Gateway:
         return time.monotonic() - began_s
 
     async def fresh_pose(self) -> float:
-        """Wait for a pose of the last half second with all sensors; return the time, s."""
+        """Wait for a pose with all sensors, at most 0.5 s old; return the elapsed time, s."""
         return await self.seconds(
             lambda: any(
                 time.time() - pose["t_us"] * 1e-6 < 0.5 and sensors_in(pose).issuperset(self.names)
@@ -377,7 +377,7 @@ class Gateway:
             await writer.wait_closed()
 
     async def event(self, device: str, *parts: str) -> float:
-        """Wait for another event; return the elapsed time, s."""
+        """Wait for another event of `device` with these parts; return the elapsed time, s."""
         self.listener.events.clear()
         return await self.seconds(lambda: self.listener.find_event(device, *parts))
 

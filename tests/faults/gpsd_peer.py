@@ -40,7 +40,7 @@ def sentence(body: str) -> bytes:
 
 
 def fix(number: int, period_s: float = PERIOD_S) -> bytes:
-    """Return the recommended minimum data (RMC) of a fix."""
+    """Return the NMEA sentence RMC (recommended minimum data) of a fix."""
     at_s = number * period_s
     clock = f"{int(at_s // 3600):02d}{int(at_s % 3600 // 60):02d}{at_s % 60.0:06.3f}"
     return sentence(f"GPRMC,{clock},A,4807.038,N,01131.000,E,0.1,0.0,281126,,,A")
@@ -74,7 +74,7 @@ class GpsdPeer:
                 self._changed.set()
 
     async def next_report(self) -> float:
-        """Wait for a further report; return the time, s."""
+        """Wait for a further report; return the elapsed time, s."""
         began_s = time.monotonic()
         self._changed.clear()
         await asyncio.wait_for(self._changed.wait(), 60.0)

@@ -42,7 +42,7 @@ class CameraServer(NatNetServer):
     firewall = False
     """Whether datagrams in both directions are dropped without an answer."""
     skeleton = False
-    """Whether a person with a bone is described, and named before the rigid body."""
+    """Whether the model description begins with a skeleton, before the rigid body."""
 
     @override
     def _handle(self, data: bytes, address: Address) -> None:
@@ -68,7 +68,7 @@ class Cameras:
 
     def __init__(self) -> None:
         self.lag_ns = 0
-        """Age of the server's clock behind that of the host, ns; grows when a recording loops."""
+        """Host clock minus server clock, ns. It increases when a played recording loops."""
         bodies = (RigidBodyAsset("Thigh", MARKERS, 1),)
         self.server = CameraServer(
             NatNetServerOptions(bodies=bodies, device_ns=lambda host_ns: host_ns - self.lag_ns)

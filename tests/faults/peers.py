@@ -1,7 +1,8 @@
 """The same faults for the daemon and for other programs: ``make faults ARGS=--peers``.
 
-A minimal publisher with aiomqtt has the faults of the broker, and gpsd has the faults of serial
-input. All programs run at the same time as the daemon, and each fault affects all at the same time.
+A minimal publisher with aiomqtt is exposed to the faults of the broker, and gpsd to the faults of
+serial input. All programs run at the same time as the daemon, and each fault affects all of them
+at the same time.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ class MessageTimes:
             await asyncio.sleep(0.01)
 
     async def recovered(self, limit_s: float) -> dict[str, float]:
-        """Wait for a message of every program; return the times that this took, s."""
+        """Wait for a message of every program; return the elapsed time of each, s."""
         began_s, found = time.monotonic(), dict[str, float]()
         async with asyncio.timeout(limit_s):
             while len(found) < len(self._names):
@@ -74,7 +75,7 @@ class MessageTimes:
 
 @contextlib.asynccontextmanager
 async def publishers(port: int) -> AsyncIterator[dict[str, asyncio.subprocess.Process]]:
-    """Run the peers of the daemon as a publisher."""
+    """Run the publishers that are compared with the daemon; yield their processes by name."""
     found = {}
     try:
         for number, (name, pause_s) in enumerate(PAUSES_S.items()):
@@ -101,7 +102,7 @@ async def meet_broker_faults(gateway: Gateway, repeat: int, found: Figures) -> N
             await times.recovered(20.0)
             for _ in range(repeat):
                 gateway.broker.stop()
-                await asyncio.sleep(OUTAGE_S + random.random())  # not in phase with a pause
+                await asyncio.sleep(OUTAGE_S + random.random())  # at a random phase of the pauses
                 gateway.broker.start()
                 for name, value_s in (await times.recovered(30.0)).items():
                     found["publishing after the broker returned"][name].append(value_s)
@@ -131,7 +132,7 @@ async def _drain(process: asyncio.subprocess.Process) -> None:
 
 
 async def _next_error(process: asyncio.subprocess.Process) -> float:
-    """Wait until a publisher reports an error; return the time, s."""
+    """Wait until a publisher reports an error; return the elapsed time, s."""
     began_s = time.monotonic()
     assert process.stdout is not None
     async with asyncio.timeout(300.0):

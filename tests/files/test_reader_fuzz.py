@@ -142,7 +142,10 @@ def edited(data: bytes, edits: list[tuple[float, int, bytes]]) -> bytes:
 
 
 def outcome(read: Callable[[Path], object], path: Path) -> str:
-    """Read a file; return "" or the message of the reader's own error, within the memory."""
+    """Read a file; return the message of the reader's own error, or "" without an error.
+
+    Fail for other exceptions, and for a peak memory of `MOST_BYTES` or more.
+    """
     tracemalloc.start()
     try:
         with warnings.catch_warnings():
@@ -233,7 +236,7 @@ def test_fragments_of_a_datagram_cost_linear_time(tmp_path: Path) -> None:
     def seconds(count: int) -> float:
         packets = b"".join(udp(7, 8 + 8 * (k % 8000), bytes(8), more=True) for k in range(count))
         data = PCAP_HEAD + packets
-        began = time.thread_time()  # other tests do not add to it
+        began = time.thread_time()  # CPU time of this thread only
         assert list(read_udp(data)) == []
         return time.thread_time() - began
 

@@ -1,4 +1,4 @@
-"""Rates of joint angles, and when they are unknown."""
+"""Rates of joint angles, and the conditions in which a rate is unknown."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fit of one frame against the independent fit of a whole trial."""
+"""Cluster poses of single frames, compared with the independent fit of a whole trial."""
 
 from __future__ import annotations
 

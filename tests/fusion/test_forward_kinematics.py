@@ -1,4 +1,4 @@
-"""Forward kinematics against Monte-Carlo simulation; fading after a change of sensors."""
+"""Forward kinematics, compared with Monte-Carlo simulation; fading after a change of sensors."""
 
 from __future__ import annotations
 

@@ -109,7 +109,8 @@ def test_segments_joints_and_flexion_agree_with_ground_truth(
     assert knee_joint is not None
     assert ankle is not None
     assert np.linalg.norm(knee_joint) == pytest.approx(LENGTH["thigh"], abs=0.01)
-    assert np.linalg.norm(np.subtract(ankle, knee_joint)) == pytest.approx(0.40, abs=0.015)  # skin
+    # The tolerance of the shank length includes soft-tissue artefact.
+    assert np.linalg.norm(np.subtract(ankle, knee_joint)) == pytest.approx(0.40, abs=0.015)
     straight = last.joints[1].inner
     assert straight is not None
     assert np.degrees(straight) == pytest.approx(180 - wanted[-1], abs=4)
@@ -129,7 +130,7 @@ def test_standard_deviations_grow_along_the_chain_and_cover_the_errors(
         claimed = np.array([s.segments[segment].sd for s in states], dtype=float)
         error = np.radians(orientation_errors_deg(states, moving, segment))
         normalized = np.sqrt(np.mean(error**2 / (3 * claimed**2)))
-        assert normalized < 1.5  # one trial type; deviations are widened
+        assert normalized < 1.5  # `widen_sd` increases sd for few training movements
 
 
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -170,7 +171,7 @@ def test_any_subset_of_sensors_gives_a_state_that_names_them(
 def test_loss_and_return_of_sensors_cause_no_jump(
     calibration: Calibration, walk: tuple[Motion, Frames], lost: set[str]
 ) -> None:
-    frames = walk[1][200:700]  # in the middle of movement
+    frames = walk[1][200:700]  # the limb moves in all these frames
     whole = play(LimbFuser(CHAIN, calibration), frames)
     parts = play(
         LimbFuser(CHAIN, calibration),
@@ -179,7 +180,7 @@ def test_loss_and_return_of_sensors_cause_no_jump(
     )
     for segment in (0, 1):
         if set(CHAIN.sensors[segment]) <= lost:
-            continue  # repeated and then lost; not continuous
+            continue  # without sensors the segment is held and then lost, so it may jump
         assert np.max(steps_deg(parts, segment)) < np.max(steps_deg(whole, segment)) + 1.2
 
 
@@ -188,7 +189,7 @@ def test_loss_and_return_of_sensors_cause_no_jump(
 def test_one_wrong_sample_at_loss_or_return_of_a_sensor_is_not_spread(
     walk: tuple[Motion, Frames], method: Method, wrong: int
 ) -> None:
-    """A loose contact corrupts samples: S2 has an error of 24 degrees once."""
+    """One sample of S2 has an error of 24 degrees, for example because of a loose contact."""
     known, frames = calibrated_with(method), walk[1][300:400]
     lost = range(40, 44)
     alive = [ALL_SENSORS - {"S2"} if k in lost else ALL_SENSORS for k in range(len(frames))]
@@ -343,7 +344,7 @@ def test_sensors_on_the_plate_are_not_compared(calibration: Calibration, worn: b
     fuser = LimbFuser(CHAIN, calibration)
     fuser.worn = worn
     flags: set[str] = set()
-    for k in range(1500):  # a common movement of all sensors, which is no limb movement
+    for k in range(1500):  # all sensors rotate together, like on a plate
         angles = np.array([0.8 * np.sin(k / 40), 0.7 * np.sin(k / 55), k / 200])
         q = as_quaternion(Rotation.from_rotvec(angles).as_quat(scalar_first=True))
         flags |= set(fuser.fuse(k * STEP, k * STEP, k, dict.fromkeys(OWNER, q)).flags)
@@ -374,6 +375,6 @@ def test_a_configured_length_is_exact_whatever_the_calibration_estimated() -> No
     assert known.position[2] == pytest.approx(-0.84)
     assert known.position_sd is not None
     assert unknown.position_sd is not None
-    # Independent length errors of 20 mm along z: the root of the mean variance per axis.
+    # Two independent length errors of 20 mm along z have this mean variance per axis.
     difference = unknown.position_sd**2 - known.position_sd**2
     assert difference == pytest.approx(2 * 0.02**2 / 3, rel=0.1)

@@ -1,4 +1,4 @@
-"""Models from online learning replace those in use without a jump."""
+"""Models from online learning replace the current models without a jump of the output."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MS = 1_000_000
 STEP_NS = 10 * MS
 HELD = moving(40, 1.2, 1)
 ROW = 25
-"""A row with large flexion, where old and new models differ most."""
+"""Index of a frame with large flexion, in which old and new models differ most."""
 
 
 @cache

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 STATIC_CHAIN = replace(CHAIN, static_axes=True)
 FLAWS = Imperfections(sensor_deg=0.3, tissue_deg=6.0, heading_deg=0.0)
 SUBJECT = Subject(5, facing=0.0, flaws=FLAWS)
-"""Subject who faces +y, with one world of sensors and cameras. The patent requires both."""
+"""Subject who faces +y. Sensors and cameras have the same world. The patent assumes both facts."""
 COUNT = 400
 STEP_NS = 10_000_000
 SAME_DEG = 0.01
@@ -67,13 +67,13 @@ def fitted(reading: PatentReading, procedure: Procedure) -> Calibration:
 
 @cache
 def recorded() -> Frames:
-    """Return the raw q_world_sensor of a movement without training, shape (n, 4), by sensor."""
+    """Return q_world_sensor, shape (n, 4), by sensor, of a movement that no fit has used."""
     tracks = record(SUBJECT, motion(SUBJECT, 10.0, 400.0), 31, cameras=False).sensors
     return {name: track.q_world_sensor[:COUNT] for name, track in tracks.items()}
 
 
 def drifting(frames: Frames) -> Frames:
-    """Rotate S2 by 1 deg/s about the vertical, and S4 by 25 degrees on the skin after 2 s."""
+    """Return the frames with a heading drift of S2 (1 deg/s), and a slip of S4 (25°, after 2 s)."""
     turn = Rotation.from_rotvec(np.radians(np.outer(np.arange(COUNT) * 0.01, [0.0, 0.0, 1.0])))
     slip = Rotation.from_rotvec(np.radians(np.outer(np.arange(COUNT) >= 200, [25.0, 0.0, 0.0])))
     return frames | {
@@ -83,7 +83,7 @@ def drifting(frames: Frames) -> Frames:
 
 
 def stuck(frames: Frames) -> Frames:
-    """Repeat the value of S1 after two seconds."""
+    """Return the frames with S1 stuck after two seconds."""
     rows = np.minimum(np.arange(COUNT), 200)
     return frames | {"S1": frames["S1"][rows]}
 
@@ -117,7 +117,7 @@ def bias(sensor: str) -> Array:
 
 
 def steps(used: Calibration, frames: Frames) -> list[Rotation]:
-    """Return q_o1 and q_o2 of every frame by steps S3 and S4."""
+    """Return the segment orientations q_o1 and q_o2 of every frame by steps S3 and S4."""
     out = []
     for segment, sensors in zip(CHAIN.segments, CHAIN.sensors, strict=True):
         table = used.quality["regression"][segment]

@@ -1,4 +1,4 @@
-"""The rotation fit at rotations of which a column of the adjugate vanishes."""
+"""Rotation fit, at rotations for which one column of the adjugate matrix is zero."""
 
 from __future__ import annotations
 

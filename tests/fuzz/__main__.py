@@ -1,10 +1,10 @@
 """Coverage-guided fuzzing of every input of the program: ``make fuzz``.
 
-Each target runs in two processes, one after the other. The first is guided by coverage (atheris,
-libFuzzer) and collects the inputs that reach new code in build/fuzz/corpus/TARGET, where the next
-run continues. The second changes these inputs at random without coverage, which is about five times
-faster. A finding is stored under build/fuzz/TARGET/, and fuzzing continues. The exit code is 1 if
-there was a finding.
+Each target runs in two processes, one after the other. The first process is guided by coverage
+(atheris, libFuzzer). It stores the inputs that reach new code in build/fuzz/corpus/TARGET, and the
+next run begins with these inputs. The second process changes these inputs at random without
+coverage, which is about five times faster. A finding is stored under build/fuzz/TARGET/, and
+fuzzing continues. The exit code is 1 if there was a finding.
 
 The instrumentation of the modules takes ten seconds, longer than a short run of a target. Each job
 therefore has one process that imports all modules, and the guided processes are its forks.
@@ -166,7 +166,7 @@ def fuzz_one(name: str, mode: str, cases: int, seconds: float) -> None:
     for number, seed in enumerate(seeds):
         (corpus / f"seed{number}").write_bytes(seed)
 
-    # Modules that are loaded once do not count for a case.
+    # Run each seed once, so that the import of modules does not count as a cost of a case.
     for seed in seeds:
         with contextlib.suppress(Exception):
             target.run(seed)
@@ -202,7 +202,7 @@ def _mutate_corpus(tally: Tally, corpus: Path, longest: int) -> None:
 
 
 def shares(names: Sequence[str], whole: float) -> dict[str, float]:
-    """Divide a number among targets by their share."""
+    """Return the part of the number `whole` for each target, according to its share."""
     from tests.fuzz.inventory import TARGETS
 
     total = sum(TARGETS[name].share for name in names)
@@ -237,8 +237,8 @@ def run_target(
 
 
 def start_guided_server() -> subprocess.Popen[str]:
-    """Start the process of `serve_guided`."""
-    with (OUT / f"{GUIDED}.log").open("ab") as log:  # libFuzzer lists all instrumented modules
+    """Start and return the process of `serve_guided`."""
+    with (OUT / f"{GUIDED}.log").open("ab") as log:  # a list of all instrumented modules
         return subprocess.Popen(
             [sys.executable, "-m", "tests.fuzz", "--serve-guided"],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True, env=ENVIRONMENT,
@@ -320,11 +320,11 @@ def fuzz_all(names: Sequence[str], cases: int, seconds: float, jobs: int) -> int
 
 
 def main() -> int:
-    """Read the command line."""
+    """Fuzz the targets on the command line; return the exit code."""
     parser = argparse.ArgumentParser(prog="make fuzz ARGS=", description=__doc__)
     parser.add_argument("targets", nargs="*", help="names of targets; default: all")
-    parser.add_argument("--cases", type=int, default=CASES, help="in all (default %(default)s)")
-    parser.add_argument("--seconds", type=float, default=0, help="at most, in all; 0: no limit")
+    parser.add_argument("--cases", type=int, default=CASES, help="of all targets (%(default)s)")
+    parser.add_argument("--seconds", type=float, default=0, help="limit for all targets; 0: none")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="targets at a time")
     parser.add_argument("--serve-guided", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--mutate", action="store_true", help=argparse.SUPPRESS)

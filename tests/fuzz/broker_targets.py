@@ -287,7 +287,7 @@ def run_spool(data: bytes) -> None:
 
 
 def seeds_spool() -> list[bytes]:
-    """Return a file of three messages, and one with a topic for a subscription."""
+    """Return a file of three messages, and a file with an invalid topic (a wildcard)."""
     kept, wild = folder() / "spool-seed", folder() / "spool-wild"
     for place, topics in ((kept, ("late/pose", "bridge/event", "late/pose")), (wild, ("late/#",))):
         SpoolFiles(place, 100_000).append([SpooledMessage(t, b'{"seq":1}') for t in topics])

@@ -37,7 +37,7 @@ class ByteCosts:
         self._target = target
         self._bins: Counter[int] = Counter()
         self.worst_s = 0.0
-        """Processor time of the worst byte, s."""
+        """Largest processor time per byte of an input, s."""
 
     def add(self, data: bytes, seconds: float) -> str:
         """Add one input; return a finding if its time per byte is too long, else an empty text."""
@@ -71,7 +71,7 @@ class ByteCosts:
 
     @property
     def ratio(self) -> float | None:
-        """Worst over median; None without enough inputs."""
+        """Ratio of the worst to the median time per byte; None without enough inputs."""
         if self._bins.total() < SETTLED:
             return None
         return self.worst_s / self.median_s

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 @cache
 def samples() -> dict[str, bytes]:
-    """Return the sample files of the simulators, text cut to its first lines."""
+    """Return the contents of the sample files of the simulators, by file name."""
     with tempfile.TemporaryDirectory() as name:
         write_sample(Path(name))
         return {path.name: path.read_bytes() for path in Path(name).iterdir() if path.is_file()}
@@ -82,7 +82,7 @@ def read_captures(path: Path) -> None:
 
 
 def run_npz_members(data: bytes) -> None:
-    """Put an input into a ZIP archive with valid checksums as the arrays of a trial."""
+    """Read a ZIP archive with valid checksums, whose arrays are parts of the input."""
     packed = io.BytesIO()
     third = len(data) // 3
     with zipfile.ZipFile(packed, "w") as archive:

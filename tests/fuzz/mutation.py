@@ -21,7 +21,7 @@ _FLOATS = tuple(
 )
 _TEXTS = (b"nan", b"inf", b"-1", b"1e999", b"9" * 20, b"[[", b"\0")
 NUMBERS = (*_INTEGERS, *_FLOATS, *_TEXTS)
-"""Limits of integers, infinite and undefined floats, and their like in text."""
+"""Limits of integers, infinite and undefined floats, and similar numbers as text."""
 MOST_CHANGES = 4
 
 

@@ -40,7 +40,7 @@ HEAD = {"id": "S1", "segment": "thigh", "driver": "serial-table", "port": "/dev/
 
 @cache
 def serial_tables() -> list[tuple[SerialTableSettings, Driver]]:
-    """Return settings and driver of each serial table; their validation costs more than a case."""
+    """Return settings and driver of each serial table, cached because validation is slow."""
     found = [serial_settings("/dev/ttyUSB0", table) for table in TABLES]
     return [(settings, find_driver("serial-table")(settings)) for settings in found]
 
@@ -53,7 +53,7 @@ def can_tables() -> list[tuple[CanTableSettings, Driver]]:
 
 
 def run_table_bytes(data: bytes) -> None:
-    """Decode serial bytes by four tables; every byte belongs to a message or is counted."""
+    """Decode serial bytes with four tables; every byte belongs to a message or is counted."""
     for settings, driver in serial_tables():
         codec, samples = open_codec(settings.wire_format()), driver.decoder()
         found: list[Any] = []
@@ -70,7 +70,7 @@ def run_table_bytes(data: bytes) -> None:
 
 
 def run_table_frames(data: bytes) -> None:
-    """Decode CAN frames of records ``u8 identifier, u8 size, data`` by two tables."""
+    """Decode CAN frames of records ``u8 identifier, u8 size, data`` with two tables."""
     for settings, driver in can_tables():
         decoder, keys = driver.decoder(), settings.keys()
         for number, (kind, content) in enumerate(records(data)):

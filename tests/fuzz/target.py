@@ -48,8 +48,8 @@ class Target:
     share : float
         Share of the cases of a run, relative to the other targets.
     longest : int
-        Largest input under coverage, bytes, or the size of the largest seed. Short inputs reach the
-        same code in less time; the tests use long inputs.
+        Largest generated input, bytes; if a seed is larger, its size is the limit. Short inputs
+        reach the same code in less time. One test uses longer inputs.
     """
 
     name: str
@@ -111,7 +111,7 @@ def _largest_bytes() -> int:
 
 
 def _described(error: Exception) -> str:
-    """Return exception and place, then the traceback; the first line is the same for one fault."""
+    """Return a line with exception and place, which identifies a fault, and then the traceback."""
     frames = traceback.extract_tb(error.__traceback__)
     place = f"{frames[-1].filename.rpartition('/')[2]}:{frames[-1].name}" if frames else "?"
     ours = [frame for frame in frames if "/jointfit_" in frame.filename]

@@ -85,7 +85,7 @@ SIZES = (1, 2, 7, 40, 300, 4096)
 _MS = 1_000_000
 _PAUSE_EVERY = 16
 _PAUSE_NS = 700 * _MS
-"""Pause after some chunks, ns. It is longer than a source may be late."""
+"""Pause after some chunks, ns. It is longer than the largest accepted delay of a source."""
 
 
 # --- cutting inputs ---------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Joint coordinates of a chain by segment name."""
+"""Functions that return the joint coordinates of a chain by segment name, for tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Angle conventions of shoulder, elbow, wrist and trunk, against SciPy's sequences."""
+"""Angle conventions of shoulder, elbow, wrist and trunk, compared with rotations of SciPy."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def quaternion(turn: Rotation) -> Quaternion:
 
 
 def read(turn: Rotation, convention: AngleConvention, *, left: bool = False) -> JointReading:
-    """Read a distal segment at `turn` relative to a rotated proximal one."""
+    """Return the angles of a joint with the rotation `turn`; the proximal segment is rotated."""
     world = Rotation.from_rotvec([0.3, -1.1, 0.7])
     one, other = quaternion(world), quaternion(world * turn)
     return read_joint(one, other, flexion_sign=1.0, left=left, convention=convention)
@@ -99,7 +99,7 @@ def test_a_mirrored_left_limb_has_the_angles_of_the_right_one(
 def test_a_shoulder_swept_through_90_degrees_has_no_jump_no_lock_and_finite_sd(
     convention: AngleConvention, rotated: float, plane: float, sd: float
 ) -> None:
-    """One degree a frame, from 20 to 160 degrees of elevation."""
+    """The elevation increases from 20 to 160 degrees, by one degree per frame."""
     rates, before = AngleRates(), None
     for frame in range(141):
         turn = Rotation.from_euler("ZYZ", [plane, -radians(20.0 + frame), rotated])
@@ -115,7 +115,7 @@ def test_a_shoulder_swept_through_90_degrees_has_no_jump_no_lock_and_finite_sd(
         assert state.main_sd is not None
         assert sd <= state.main_sd < 12.0 * sd  # magnified by tilt / sin(tilt) = 8.2 at 160 degrees
         if before is not None:
-            # one degree, magnified across the tilt
+            # no angle changes by more than the one degree of the movement
             assert max(map(apart, state.angles, before)) < radians(1.001)
         before = state.angles
         rate = rates.update(frame * 10_000_000, "shoulder", state.angles, gimbal=state.gimbal)
@@ -170,7 +170,10 @@ def test_sd_of_tilt_matches_monte_carlo(tilt_deg: float) -> None:
 def test_trunk_angles_are_those_of_the_upper_segment_on_the_lower_one(
     bend: float, right: float, turned: float
 ) -> None:
-    """Forward, to the right, and to the left are positive; the upper segment comes first."""
+    """Positive angles are flexion forward, bending to the right and rotation to the left.
+
+    The upper segment is the proximal segment.
+    """
     upper_on_lower = Rotation.from_euler("XYZ", [-bend, right, turned])
     reading = read(upper_on_lower.inv(), TRUNK)
     assert reading.angles == pytest.approx((bend, right, turned), abs=1e-9)

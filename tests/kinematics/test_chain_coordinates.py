@@ -99,7 +99,7 @@ def test_angles_are_continuous_beyond_180_degrees() -> None:
 def test_angles_are_continuous_over_known_instants_only() -> None:
     turned = np.zeros((50, 10))
     turned[:, 2] = 0.5
-    turned[20:30, 2] = np.linspace(2.5, 5.7, 10)  # a turn that leads back by another 360 degrees
+    turned[20:30, 2] = np.linspace(2.5, 5.7, 10)  # continues to the next full turn
     turned[30:, 2] = 0.5 + 2.0 * np.pi
     coordinates = default_coordinates(MODEL)
     known = np.ones((50, 10), np.bool_)
@@ -187,7 +187,7 @@ def test_standard_deviations_are_those_of_repeated_trials() -> None:
 def test_coordinates_without_markers_are_undetermined() -> None:
     state = apply_step(MODEL, rest_state(MODEL, 6), np.full((6, MODEL.nq), 0.2))
     y = marker_positions(MODEL, state)
-    y[2, 8:] = np.nan  # no marker of the shank in one instant
+    y[2, 8:] = np.nan  # in one instant no marker of the shank is visible
     _, determined = pose_covariance(MODEL, solve_frames(MODEL, y))
     assert not determined[2, -1]
     assert determined[:, :-1].all()

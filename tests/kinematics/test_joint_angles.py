@@ -1,4 +1,4 @@
-"""Joint angles against SciPy's Euler sequences, finite differences and geometry."""
+"""Joint angles, compared with Euler sequences of SciPy, finite differences and geometry."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 DEG = math.pi / 180.0
 LOCKED = np.array([[0.4, math.pi / 2, 0.9], [-0.4, -math.pi / 2, 0.2], [0.1, math.pi / 2, 3.0]])
-"""Rotations about z, y, x at which the outer angles of the patent have the same axis."""
+"""Rotations about z, y and x, rad. With these angles, the rotations about z and x have one axis."""
 
 
 def random_rotations(count: int, seed: int = 0) -> NDArray[np.float64]:
@@ -65,7 +65,8 @@ def test_gimbal_lock_is_flagged_and_keeps_the_rotation(theta: float) -> None:
 
 
 def test_a_flexed_and_adducted_joint_reads_differently_by_each_definition() -> None:
-    # flexion 60, adduction 20 degrees of a right knee: the figures of the reference text
+    # A right knee has 60 degrees of flexion and 20 degrees of adduction. The expected values are
+    # independent of this program.
     q = from_sequence("XYZ", np.array([-60.0, 20.0, 0.0]) * DEG)
     assert patent_angles(q).angles[0] / DEG == pytest.approx(-61.5, abs=0.05)
     assert float(included_angle(q)) / DEG == pytest.approx(62.0, abs=0.05)

@@ -1,4 +1,4 @@
-"""Rotations, compared with SciPy, which has independent code, and with group properties."""
+"""Rotations, compared with SciPy and with properties of the rotation group."""
 
 from __future__ import annotations
 

@@ -8,7 +8,8 @@ from typing import Any
 RESULTS = Path(__file__).parent / "results.json"
 COUNTERS = ("lost", "corrupt", "dropped", "late")
 SMALLEST_SHARE = 0.98
-"""Smallest ratio of sent samples to rate times duration. With a smaller ratio, load was too low."""
+"""Smallest ratio of sent samples to rate times duration. With a smaller ratio, the load was too
+low."""
 
 
 def table_of(results: dict[str, Any]) -> str:

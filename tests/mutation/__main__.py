@@ -63,9 +63,9 @@ def main() -> int:
     """Test a sample of mutants, or the stored survivors again, and print each outcome."""
     parser = argparse.ArgumentParser(prog="make mutation", description=__doc__)
     parser.add_argument("--mutants", type=int, default=200, help="size of the sample")
-    parser.add_argument("--seed", type=int, default=20, help="of the sample (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=20, help="random seed (default: %(default)s)")
     parser.add_argument("--jobs", type=int, default=1, help="mutants tested at the same time")
-    parser.add_argument("--store", action="store_true", help="for docs/reliability.md")
+    parser.add_argument("--store", action="store_true", help="store the outcomes")
     parser.add_argument(
         "--review", action="store_true", help="only test the stored survivors again, and store"
     )
@@ -133,7 +133,7 @@ def _import_libraries() -> None:
 
 
 def sample(size: int, seed: int) -> list[Chosen]:
-    """Return mutants drawn at random, as many of each package as it has mutants."""
+    """Return `size` mutants drawn at random from all mutants of all packages."""
     everything = [
         (package, mutant)
         for package, (sources, _) in PACKAGES.items()
@@ -207,9 +207,10 @@ def _executions(package: str) -> dict[str, Any]:
 
 
 def judge(package: str, mutant: Mutant) -> tuple[bool, str, str]:
-    """Return whether a test fails that executes the changed statement, and the change.
+    """Return whether a test detects the mutant, and the changed line before and after.
 
-    If an import executes the statement, all tests of the nearest folder are run, too.
+    The tests that execute the changed statement are run. If an import executes the statement, all
+    tests of the nearest folder are run, too.
     """
     executions = _executions(package)
     tests, at_import = tests_of(mutant.path, mutant.line, executions)
@@ -229,7 +230,7 @@ def judge(package: str, mutant: Mutant) -> tuple[bool, str, str]:
 
 
 def nearest_folder(path: Path, package: str) -> str:
-    """Return the folder of tests with the name of the nearest folder of a module."""
+    """Return the test folder that corresponds to the nearest folder of a module."""
     sources, tests = (ROOT / folder for folder in PACKAGES[package])
     nearest = path.parent
     while not (tests / nearest.relative_to(sources)).is_dir():
@@ -255,7 +256,7 @@ def in_fork(run: Callable[[], int], log: Path = Path(os.devnull)) -> int:
 
 
 def _wait(child: int) -> int:
-    """Wait for the tests, and kill them with their processes when their time is over."""
+    """Wait for the tests, or kill them after `WALL_S`; return their exit code."""
     end_s, status = time.monotonic() + WALL_S, 0
     while time.monotonic() < end_s:
         ended, status = os.waitpid(child, os.WNOHANG)

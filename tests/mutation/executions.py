@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 IMPORT = ""
 """Context of lines that are executed while pytest imports the tests."""
 SHARED_STATE = re.compile(r"^@cache\b|scope=", re.MULTILINE)
-"""In a file with a cached result, a test depends on lines that an earlier test executed."""
+"""Pattern of files with cached results or shared fixtures. There, a test depends on lines that only
+an earlier test executed."""
 
 
 class ExecutionRecorder:
@@ -71,7 +72,7 @@ class ExecutionRecorder:
 
 
 def tests_of(path: Path, line: int, executions: dict[str, Any]) -> tuple[list[str], bool]:
-    """Return the tests that execute a statement, fast tests first, and whether an import does.
+    """Return the tests that execute a statement, fast ones first, and whether an import does so.
 
     Tests of one file stay together, because they may have fixtures in common.
     """

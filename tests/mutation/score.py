@@ -35,7 +35,7 @@ def stored_outcomes(
     if [[one[key] for key in keys] for one in stored] != [
         [one[key] for key in keys] for one in drawn
     ]:
-        sys.exit("--resume: the stored sample is another one, or the code changed: leave it out")
+        sys.exit("--resume: the stored sample is another one, or the code changed: omit it")
     return stored
 
 
@@ -57,8 +57,9 @@ def text_of(results: dict[str, Any]) -> str:
 def table_of(mutants: list[dict[str, Any]]) -> str:
     """Return the score of each package and of all, as drawn and after the review, as a table.
 
-    In the score as drawn, every mutant counts that no test noticed. Equivalent mutants behave as
-    the original, so no test can fail; they and removed code do not count after the review.
+    The score as drawn is the share of killed mutants in the sample. Equivalent mutants behave as
+    the original, so no test can fail. The score after the review excludes equivalent mutants and
+    removed code.
     """
     rows = [
         "| package | mutants | killed | score, % | interval, % | killed later | equivalent |"

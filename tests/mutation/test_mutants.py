@@ -1,4 +1,4 @@
-"""Mutants are those that a test can notice, and the score has its interval."""
+"""Mutants change only code that a test can observe, and the score has a confidence interval."""
 
 from __future__ import annotations
 

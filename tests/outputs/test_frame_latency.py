@@ -93,7 +93,7 @@ def test_the_stages_of_a_frame_add_up() -> None:
 def test_frames_released_together_are_encoded_in_their_order() -> None:
     latency = FrameLatency(clock := Clock())
     clock.now_ns = 100 * MS
-    latency.mark_decoded(99 * MS)  # of another frame, before the deadlines were due
+    latency.mark_decoded(99 * MS)  # a chunk of another frame, before the deadlines
     latency.mark_aligned()
     for deadline_ns in (60 * MS, 80 * MS):
         clock.now_ns += 1 * MS
@@ -129,5 +129,5 @@ def test_a_core_marks_every_frame_and_computes_the_same() -> None:
     latency.end_interval()
     health = latency.health
     assert health.frames == frames
-    step_ms = STEP_NS / MS  # one reading of the clock after each stage
+    step_ms = STEP_NS / MS  # each stage ends with one reading of the clock
     assert {longest_ms(health)[stage] for stage in ("decoded", "aligned", "fused")} == {step_ms}

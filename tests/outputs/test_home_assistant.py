@@ -1,7 +1,7 @@
 """The discovery message follows the rules of Home Assistant, and its templates read the payloads.
 
 The rules are from its documentation ("MQTT discovery", "MQTT sensor", "MQTT binary sensor", "MQTT
-button"). Here, they are a JSON Schema.
+button"). This module contains them as a JSON Schema.
 """
 
 from __future__ import annotations
@@ -178,7 +178,7 @@ def test_an_unknown_angle_is_unknown_to_home_assistant(
         ({"online": True, "sensor": "stuck"}, "ON"),
         ({"online": True, "sensor": "lost"}, "ON"),
         ({"online": False, "sensor": "ok"}, "ON"),
-        ({"online": True}, "OFF"),  # cameras
+        ({"online": True}, "OFF"),  # cameras have no state `sensor`
     ],
 )
 def test_a_device_has_a_problem_when_disconnected_silent_or_stuck(

@@ -1,4 +1,4 @@
-"""Steps of UNIX time during operation: the clock follows, and the frames remain in order."""
+"""Steps of UNIX time during operation: `UnixClock` follows, and the frames remain in order."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 NS = 1_000_000_000
 HEADINGS = st.floats(-180.0, 180.0)
 HANDS = st.lists(st.floats(-5.0, 5.0), min_size=12, max_size=12)
-"""Inaccuracy of each pose, rotation vector in degrees."""
+"""Components of four rotation vectors, deg: the inaccuracies of the four poses."""
 
 
 def poses(heading_deg: float, hand_deg: list[float]) -> Rotation:

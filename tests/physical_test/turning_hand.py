@@ -28,7 +28,7 @@ joints = ["hip", "knee", "ankle"]
 
 
 class Hand:
-    """Turns the device to the next pose at each instruction; it rests there."""
+    """Turns the device to the next pose at each instruction, and holds it at rest there."""
 
     def __init__(self, device: WitMotionDevice) -> None:
         poses = guided_poses()

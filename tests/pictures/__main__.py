@@ -1,4 +1,4 @@
-"""Makes the generated pictures of the documentation: `make pictures`, four minutes."""
+"""Makes the generated pictures of the documentation. `make pictures` takes four minutes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of the dashboard's calibration and check of axes, on a rig that only publishes."""
+"""Pictures of the dashboard's calibration and check of axes, with prepared messages of a rig."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tests.broker_fixture import Broker
 
 SHOWN = 2 / 3
-"""Size of a picture of the calibration, as a share of the window's."""
+"""Size of a picture of the calibration relative to the size of the browser window."""
 SETTLE_S = 3.0
 """Time after which a page has the clock of the gateway and its first curve, s."""
 UNKNOWN_JOINT = {
@@ -140,7 +140,7 @@ async def _photograph(broker: Broker, browser: Browser, url: str, pictures: Path
 
 
 async def _settled(page: OpenedPage) -> bytes:
-    """Return a PNG of the window, with the port of a broker that a reader has."""
+    """Return a PNG of the settled page, which shows the default port of the broker."""
     await asyncio.sleep(SETTLE_S)
     await page.page.evaluate(SHOW_BROKER, f"{HOST}:1883")
     return await page.page.screenshot()

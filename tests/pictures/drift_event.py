@@ -1,4 +1,4 @@
-"""Drawing of a heading drift: error of the knee rotation with and without correction, event.
+"""Drawing of a heading drift: event, and error of knee rotation with and without correction.
 
 The subject is simulated, the calibration and the fusion are those of the daemon.
 """
@@ -41,7 +41,7 @@ class DriftRun(NamedTuple):
 
 
 def run() -> DriftRun:
-    """Run the fusion on a drifting subject, with and without the correction of headings."""
+    """Run the fusion with heading drift, with and without its correction; return the errors."""
     calibration = faulty_wearer.calibrated(SEED)
     assert calibration is not None
     person = faulty_wearer.live(SEED, SECONDS, RATE_HZ)

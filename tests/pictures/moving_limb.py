@@ -23,7 +23,7 @@ LONGEST_S, SHORTEST_S = 8.0, 5.0
 REPEATS = 3
 SIZE = (820, 400)
 HIP_X, HIP_Y, METRE = 170.0, 84.0, 330.0
-"""Place of the hip, and pixels of a metre."""
+"""Position of the hip in the drawing, and length of a metre, pixels."""
 LEFT, RIGHT, TOP, BOTTOM = 380.0, 780.0, 150.0, 330.0
 LARGEST_DEG = 80.0
 PLACES = (0.3, 0.72)

@@ -66,7 +66,7 @@ TERMINALS = {
     ),
     "head": ("export", "Rows of the CSV file with time and knee angles"),
 }
-"""Begin of a command: name of its picture, and its description."""
+"""Name and description of each picture, by the begin of the command that it shows."""
 
 
 class TutorialRun:
@@ -108,7 +108,7 @@ class TutorialRun:
         async with self._page() as page:
             await page.until_text(selector, words, 60)
             await asyncio.sleep(wait_s)
-            await page.page.evaluate(SHOW_BROKER, "127.0.0.1:1883")  # the port of a reader
+            await page.page.evaluate(SHOW_BROKER, "127.0.0.1:1883")  # default port
             png = await page.page.screenshot(full_page=True)
             self._write(f"tutorial-{name}.webp", webp(png))
 
@@ -138,7 +138,7 @@ class TutorialRun:
         self._write(f"tutorial-{name}.svg", drawn.encode())
 
     def _shown(self, printed: str) -> str:
-        """Return the last lines, with the port and the folder of a reader."""
+        """Return the last lines, with the default port and the folder of the tutorial."""
         own = printed.replace(str(self._reader), "~/jointfitd")
         own = re.sub(rf"\b{self._broker.port}\b", "1883", own)
         own = re.sub(

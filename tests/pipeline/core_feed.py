@@ -122,7 +122,7 @@ def camera_hello(t_ns: int) -> list[Event]:
 
 
 def chunk(name: str, number: int, delay_ns: int | None = None) -> ChunkArrived:
-    """Return sample `number` of any source as it arrives."""
+    """Return the chunk with sample `number` of a source, which arrives after `delay_ns`."""
     t_ns = BEGIN_NS + number * PERIOD_NS + (DELAYS_NS[name] if delay_ns is None else delay_ns)
     if name == "mocap":
         return ChunkArrived(name, Chunk(t_ns, camera_bytes(number)))

@@ -1,4 +1,4 @@
-"""Exchanged marker labels of a rig without chain model, from the bytes of the cameras on."""
+"""Core: exchanged marker labels of a rig without chain model, from camera bytes to notices."""
 
 from __future__ import annotations
 
@@ -135,7 +135,8 @@ def test_the_core_names_the_markers_publishes_no_wrong_pose_and_recovers(
     assert end.data["state"] == "ok"
     assert begin.data["markers"] == list(labels)
 
-    # With two of four markers, the thigh has no pose; three of four give the pose without them.
+    # Exchanged markers are hidden. With two of its four markers the thigh has no pose, and with
+    # three of them it has a pose.
     during, after = optical(bench, 3.0, 5.0), optical(bench, 7.5, 8.5)
     assert len(during) > 20
     healthy = {one.t_ns: one for one in optical(correct(), 3.0, 5.0)}

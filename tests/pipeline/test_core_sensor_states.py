@@ -1,4 +1,4 @@
-"""Sensors of a frame as an output of the core: rate, content, and the patent's steps on them."""
+"""Sensor states as an output of the core: rate, content, and pose by the steps of the patent."""
 
 from __future__ import annotations
 

@@ -247,7 +247,7 @@ def test_all_clocks_settle_again_after_suspend(asleep_s: float) -> None:
 
 
 def test_all_clocks_settle_again_after_suspend_with_lost_ports() -> None:
-    """As after a real suspend, drivers detect a loss and reconnect a second later."""
+    """Drivers detect a loss and reconnect a second later, as they do after a real suspend."""
 
     def slept(sent: Sent) -> Sent | None:
         sent.device_ns += 3_600 * NS
@@ -371,9 +371,9 @@ troubles = st.lists(
     st.tuples(
         st.sampled_from(sorted(FAULTS)),
         st.sampled_from(SENSORS),
-        st.integers(0, 200),  # first sample after FAULT
-        st.integers(1, 120),  # length
-        st.integers(1, 200),  # size
+        st.integers(0, 200),  # first affected sample, counted from FAULT
+        st.integers(1, 120),  # number of affected samples
+        st.integers(1, 200),  # size of the fault
     ),
     max_size=6,
 )

@@ -70,7 +70,7 @@ class UnixTimeCore(Core):
 
 
 def frame(number: int) -> ChunkArrived:
-    """Return camera frame `number`, taken with the samples of that number, 6 ms later."""
+    """Return camera frame `number`, which arrives 6 ms after the instant of sample `number`."""
     t_ns = BEGIN_NS + number * PERIOD_NS
     told = divmod(t_ns + UNIX_NS + TAI_NS, S)
     data = FrameOfData(number, 0.0, number, number + 1, number + 2, precision=told)
@@ -167,7 +167,7 @@ def test_wrong_unix_time_moves_no_stamp_and_is_used_again_when_corrected(
     rig.set_unix_time(UNIX_NS)
     rig.stream(16)  # the error of passive time is slewed away
     assert rig.state() == "direct"
-    assert max(map(abs, rig.errors_ms(30))) < 4.1  # 6 ms of delay, 10 assumed from arrivals alone
+    assert max(map(abs, rig.errors_ms(30))) < 4.1  # the delay is 6 ms, its prior 10 ms
     assert rig.errors_ms(rig.number - 10) == [0.0] * 10
     stamps = [t_ns for _, t_ns, _, _ in rig.core.frames]
     assert all(b > a for a, b in itertools.pairwise(stamps))

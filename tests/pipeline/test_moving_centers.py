@@ -79,7 +79,7 @@ def centers_of(
 
 
 def with_moved_knee(moving: Motion, meters: float, from_s: float) -> Motion:
-    """Return a movement in which the knee lies further forward in the thigh after some seconds."""
+    """Return a movement with the knee `meters` further forward in the thigh from `from_s` on."""
     offset = np.zeros((len(moving.t_s), 3))
     offset[moving.t_s >= from_s, 1] = meters
     moved = moving.q["thigh"].apply(offset)

@@ -75,10 +75,11 @@ def vector(point: np.ndarray) -> Vector:
 
 
 def limb_states(shank_error: Rotation | None = None) -> list[LimbState]:
-    """Return states with the true bones; an error rotates the shank in its own axes."""
+    """Return states with the true bones; `shank_error` rotates the shank in its own axes."""
     moving, wrong = truth(), shank_error or Rotation.identity()
     t = np.arange(moving.t_s[0], moving.t_s[-1], 1 / RATE_HZ)
-    # Axes of the calibration: what the cameras see in the static pose, to a constant rotation.
+    # In the calibration, the axes of a segment differ from the axes of its bone by a constant
+    # rotation.
     thigh, shank = (Slerp(moving.t_s, moving.q[name])(t) for name in ("thigh", "shank"))
     thigh, shank = thigh * axes("thigh"), shank * axes("shank") * wrong
     hips = np.stack([np.interp(t, moving.t_s, moving.p["thigh"][:, k]) for k in range(3)], axis=1)
@@ -107,8 +108,8 @@ def limb_states(shank_error: Rotation | None = None) -> list[LimbState]:
 def axes(segment: str) -> Rotation:
     """Return the constant rotation from the bone of the subject to the segment of its calibration.
 
-    The rotation is from the first camera frame, in which the subject stands. The calibration may
-    choose its axes.
+    The rotation is computed from the first camera frame, in which the subject stands, because the
+    calibration may choose the axes of a segment.
     """
     comparison = OpticalComparison(CHAIN, calibration(), 1000.0)
     t_ns, frame = camera_frames()[0]
@@ -185,7 +186,7 @@ def test_residual_flexion_is_imu_minus_cameras(error_deg: float) -> None:
     knee = last.joints[1]
     assert knee.residual is not None
     assert knee.residual_rms is not None
-    # Flexion of the knee is negative about x.
+    # Knee flexion is a negative rotation about x.
     assert math.degrees(knee.residual.flexion) == pytest.approx(-error_deg, abs=0.5)
     assert math.degrees(knee.residual_rms.flexion) == pytest.approx(abs(error_deg), abs=0.5)
     shank = last.segments[1]
@@ -196,7 +197,7 @@ def test_residual_flexion_is_imu_minus_cameras(error_deg: float) -> None:
 def test_position_residual_needs_the_origin_from_the_cameras() -> None:
     states = limb_states()[:200]
     seen = compare(states)[-1]
-    assert seen.joints[0].distance is None  # the origin itself
+    assert seen.joints[0].distance is None  # the origin is not compared with itself
     assert seen.joints[1].distance == pytest.approx(0.0, abs=0.005)
     for other in ({"mode": FusionMode.IMU}, {"flags": (FrameFlag.ORIGIN_FIXED,)}):
         seen = compare([state._replace(**other) for state in states])[-1]
@@ -268,6 +269,6 @@ def test_running_rms_forgets_within_its_time() -> None:
     assert value == pytest.approx(3.0)
     for k in range(300, 600):
         value = rms.add(k * 100_000_000, 1.0)
-    # After three time constants, exp(-3) of the weight is left on the value before.
+    # After three time constants, the earlier value has the fraction exp(-3) of the weight.
     share = math.exp(-3.0)
     assert value == pytest.approx(math.sqrt(1.0 + 8.0 * share), rel=0.02)

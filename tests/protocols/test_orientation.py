@@ -1,4 +1,4 @@
-"""The canonical orientation, compared with SciPy, and the acceptance of quaternions."""
+"""The conversion to canonical orientations agrees with SciPy; wrong norms are rejected."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_ninety_one_rejected_samples_of_the_first_hundred_are_a_wrong_scale() ->
     assert gate.misconfigured_norm == 0.5
     for _ in range(500):
         gate.admit((1.0, 0.0, 0.0, 0.0))
-    assert gate.misconfigured_norm == 0.5  # only the first hundred count
+    assert gate.misconfigured_norm == 0.5  # later samples do not change the median
 
 
 def test_samples_without_a_finite_norm_have_no_median() -> None:

@@ -1,4 +1,4 @@
-"""Offline calibration: the phases of the recording again, and the same result."""
+"""Offline calibration repeats the phases of a recording and yields the live result."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_result_is_that_of_the_live_session_with_its_date(run: RecordedRun) -> N
     assert found.calibration is not None
     assert found.rejected is None
     date = found.calibration.created_utc
-    assert date.startswith("2026-11-18T")  # of the session, not of today
+    assert date.startswith("2026-11-18T")  # the date of the session, not of today
     expected = calibration_text(replace(run.calibration, created_utc=date))
     assert calibration_text(found.calibration) == expected
 

@@ -1,4 +1,4 @@
-"""Arrays of a recording: as recorded, and processed again."""
+"""A recording becomes arrays, with the recorded configuration or with another one."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_session_has_the_segments_and_joints_of_the_run(
     thigh, knee = session.segments[0], session.joints[1]
     assert (thigh.name, knee.name) == ("thigh", "knee")
     assert len(thigh.t_s) == len(knee.t_s) == run.states
-    # unknown before the calibration, known after it
+    # The orientation is unknown before the calibration.
     assert np.isnan(thigh.orientation[:50]).all()
     after = thigh.t_s > 0.01 * (FITTED + 2)
     assert np.isfinite(thigh.orientation[after]).all()
@@ -96,7 +96,7 @@ def test_marks_phases_and_losses_are_on_the_time_line(session: SessionData) -> N
 
 
 def test_positions_from_the_fixed_origin_are_unknown_beside_measured_positions() -> None:
-    """Positions of both kinds in one column would jump by the distance of the origins."""
+    """Positions from both origins in one column would jump by the distance between the origins."""
     collector = SessionCollector()
     hip = JointState("hip", (0.0, 0.0, 0.9), 0.002, JointAngles(0.1, 0.0, 0.0))
     modes: list[tuple[FusionMode, tuple[str, ...]]] = [

@@ -1,4 +1,4 @@
-"""Sessions of a simulated subject as arrays, with errors of known size; truth is known, too."""
+"""Sessions of a simulated subject as arrays, with errors of known size, and true angles."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 RATE_HZ = 100.0
 CAMERA_HZ = 120.0
 STRIDE_S = 1.1
-"""Duration of a stride of the simulated subject, s; a heel strike every multiple of it."""
+"""Duration of a stride of the simulated subject, s. Its multiples are the times of heel strikes."""
 ERROR_RAD = np.radians(1.2)
 """Standard deviation of the orientation error per axis, rad."""
 ANGLES = ("flexion", "adduction", "rotation")

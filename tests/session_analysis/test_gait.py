@@ -55,7 +55,8 @@ def test_mean_curve_of_the_knee_equals_the_true_one(
     for seed, (session, gait) in walks.items():
         knee = session.joints[0]
         found = normalize_cycles(knee.t_s, knee.angles["flexion"], gait.cycles_s)
-        # True cycles are of one length, and begin with the mean delay of the events.
+        # The reference cycles have the true length. They begin at the heel strikes plus the mean
+        # delay of the detected contacts.
         strikes = np.round(gait.cycles_s[:, 0] / STRIDE_S) * STRIDE_S
         begin = strikes + (gait.cycles_s[:, 0] - strikes).mean()
         cycles = np.column_stack([begin, begin + STRIDE_S])

@@ -1,4 +1,4 @@
-"""Range of motion, difference to the cameras and gaps, against values known by construction."""
+"""Range of motion, difference from the cameras and gaps equal values known by construction."""
 
 from __future__ import annotations
 

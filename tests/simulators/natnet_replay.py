@@ -1,4 +1,4 @@
-"""NatNet server that replays a capture. Invariant: frames are sent as the recorded bytes."""
+"""NatNet server that replays a capture. Invariant: frames are sent as recorded, byte for byte."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class NatNetReplay(RecordedCameras):
 
     @override
     async def run(self) -> None:
-        """Answer until cancelled; send the frames once the first client has the model."""
+        """Answer until cancelled; send all frames after the first client has received the model."""
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(super().run(), name="natnet replay answers")
             while not self.ready:

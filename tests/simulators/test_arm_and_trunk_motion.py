@@ -54,7 +54,7 @@ def test_arm_is_rigid_and_its_joints_are_the_ends_of_its_bones(
     np.testing.assert_allclose(upper_arm.inv().apply(along), [[0, 0, -UPPER_ARM_M]], atol=1e-12)
     along = (pose.origins["hand"] - pose.origins["forearm"])[0]
     np.testing.assert_allclose(forearm.inv().apply(along), [[0, 0, -FOREARM_M]], atol=1e-12)
-    # pronation after carrying angle after flexion, as textbook sequence
+    # Textbook sequence: flexion, carrying angle, pronation, each about the rotated axis.
     elbow = (upper_arm.inv() * forearm).as_euler("XYZ")
     np.testing.assert_allclose(elbow, [angles[6:9]], atol=1e-9)
 
@@ -94,7 +94,8 @@ def test_every_motion_has_two_continuous_derivatives(limb: str, name: str) -> No
         [Step("stand", 2.0), Step(name, 4.0), Step("functional", 9.0)],
     )
     jumps = []
-    for step in (2e-3, 1e-3):  # the change of a continuous derivative decreases with the step
+    # If the second derivative is continuous, its largest change decreases with the step.
+    for step in (2e-3, 1e-3):
         second = np.diff(script.coordinates(np.arange(1.0, 9.0, step)), n=2, axis=0) / step**2
         jumps.append(float(np.abs(np.diff(second, axis=0)).max()))
     assert jumps[1] < 0.65 * jumps[0]
@@ -138,7 +139,7 @@ def test_observation_agrees_with_the_bones_of_every_limb(limb: str) -> None:
             np.testing.assert_allclose(local, np.broadcast_to(local[0], local.shape), atol=1e-9)
     main = LIMBS[limb].main
     assert found.truth.joint == main.name == subject.facts["joint"]
-    # the angles of the log are those of the bones, by SciPy's sequence
+    # The logged angles equal the angles that SciPy computes from the bones.
     upper, lower = (found.truth.orientations[p] for p in (main.proximal, main.distal))
     sign = -1.0 if limb in {"leg", "legs", "trunk"} else 1.0
     angles = (upper.inv() * lower).as_euler("XYZ") * [sign, 1.0, 1.0]

@@ -36,7 +36,7 @@ def rms(lengths: ArrayLike) -> float:
 def relative_orientations(
     knobs: Knobs, script: str = "walk:60,squat:60", t: np.ndarray = T
 ) -> list[Rotation]:
-    """Return the true orientations of S1 to S4 relative to their bones, with alignment."""
+    """Return the true rotations of S1 to S4 relative to their bones, including alignment."""
     subject = SimulatedSubject(knobs, parse_motion_script(script))
     found = subject.observe([t] * 4, NONE, t)
     return [
@@ -136,7 +136,7 @@ def test_slow_and_white_orientation_errors_have_their_rms(name: str) -> None:
     slow = sensor_error(dataclasses.replace(NO_ERRORS, orientation_slow_deg=1.0), name)
     assert np.degrees(rms(slow.magnitude())) == pytest.approx(1.0, rel=0.1)
     second = np.degrees((slow[:-10].inv() * slow[10:]).magnitude())
-    assert rms(second) < 0.5  # little change within a second
+    assert rms(second) < 0.5  # the slow error changes little in a second
     white = sensor_error(dataclasses.replace(NO_ERRORS, orientation_white_deg=0.3), name)
     assert np.degrees(rms(white.magnitude())) == pytest.approx(0.3, rel=0.05)
 

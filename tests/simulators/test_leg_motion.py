@@ -1,4 +1,4 @@
-"""Ground truth: constant bone lengths, clinical signs, smooth motions."""
+"""Ground truth of the simulated leg: bone lengths, clinical signs, and smooth motions."""
 
 from __future__ import annotations
 
@@ -160,7 +160,8 @@ def test_every_motion_has_two_continuous_derivatives(name: str) -> None:
         MOTIONS_OF_STYLE, [Step("stand", 2.0), Step(name, 4.0), Step("squat", 9.0)]
     )
     jumps = []
-    for step in (2e-3, 1e-3):  # the change of a continuous derivative decreases with the step
+    # If the second derivative is continuous, its largest change decreases with the step.
+    for step in (2e-3, 1e-3):
         t = np.arange(1.0, 9.0, step)
         jumps.append(jerkiness(script.coordinates(t), step))
     assert jumps[1] < 0.65 * jumps[0]

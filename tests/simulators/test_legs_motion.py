@@ -69,7 +69,7 @@ def test_the_right_leg_walks_like_the_single_leg_and_the_left_one_half_a_stride_
     np.testing.assert_array_equal(legs_pose(both).origins["right_foot"], pose.origins["foot"])
     right, left = both[:, KNEE.start], both[:, LEFT_KNEE.start]
     delay = min(range(110), key=lambda k: float(np.std(left[k:] - right[: len(right) - k])))
-    assert delay in range(51, 60)  # of a stride of 110 frames
+    assert delay in range(51, 60)  # half a stride of 110 frames
 
 
 def test_the_functional_motion_moves_every_joint_of_both_legs() -> None:

@@ -1,4 +1,4 @@
-"""A simulated limb that streams by a family of cameras reaches the driver named in rig.toml."""
+"""The driver named in rig.toml receives the markers of a limb from each simulated server."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.real_time
 
 
 WHOLE_FRAMES = ("natnet", "qtm", "vicon", "lsl-markers")
-"""Families whose frames contain all markers; VRPN sends each tracker by itself."""
+"""Families whose frames contain all markers. VRPN sends each tracker in its own message."""
 
 
 @pytest.mark.parametrize("family", WHOLE_FRAMES)

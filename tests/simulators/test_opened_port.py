@@ -1,4 +1,4 @@
-"""A simulated device reads its serial port from the first time that the host opens the port."""
+"""A simulated device detects that a host has opened its serial port for the first time."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ async def test_a_port_is_read_a_while_after_its_opening(line: PtyLine) -> None:
         read.append(port.is_read)
         await asyncio.sleep(0.25)
         read.append(port.is_read)
-    read.append(port.is_read)  # a later opening is that of a device that sends
+    read.append(port.is_read)  # only the first opening counts
     assert read == [False, False, True, True]
 
 

@@ -96,7 +96,7 @@ async def rejected(*options: str) -> tuple[int | None, str]:
 
 
 def links_in(folder: Path) -> dict[str, Path]:
-    """Return the targets of the link_targets to the ptys."""
+    """Return the pseudo-terminals to which the links in a folder point, by name of the link."""
     return {path.name: path.readlink() for path in folder.glob("tty*")}
 
 

@@ -1,4 +1,4 @@
-"""Components of the simulated QTM server, to the bit."""
+"""Missing positions in the components that the simulated QTM server sends."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def test_all_bits_of_missing_positions_are_set_and_no_other_number_changes() -> 
     ticks = 0x7FC0_0000_7FC0_0000  # contains the bytes of the usual NaN
     parts = components(KINDS, {}, {}, assets=(BODY,), axes=axes_from_z_up("z"), camera_ticks=ticks)
     data = qtm.encode(qtm.DataFrame(0x7FC0_0000, 0x7FC0_0000, tuple(parts)))
-    assert data.count(b"\xff" * 12) == 5  # one marker, and four times that of one body
+    assert data.count(b"\xff" * 12) == 5  # 12 bytes of the marker, 48 of the body
     frame = qtm.decode(data)
     assert isinstance(frame, qtm.DataFrame)
     assert (frame.timestamp_us, frame.number) == (0x7FC0_0000, 0x7FC0_0000)

@@ -18,7 +18,7 @@ from jointfit_simulators.scene._sample_log import SampleLog
 from jointfit_simulators.settings import Knobs
 
 NOW = 10**13
-"""Host time for parts without a clock, ns."""
+"""Host time for objects that do not read the clock themselves, ns."""
 
 
 def test_prescribed_clock_has_its_skew_and_uptime() -> None:
@@ -50,7 +50,7 @@ def test_sample_log_contains_device_number_and_instant(tmp_path: Path) -> None:
 def scene(folder: Path, **options: Any) -> Scene:
     knobs = Knobs()
     subject = SimulatedSubject(knobs, parse_motion_script("stand"), motion_files={})
-    now_ns = time.monotonic_ns()  # the scheduled commands refer to it
+    now_ns = time.monotonic_ns()  # scheduled commands count from this time
     return Scene(knobs, subject, SceneOptions(folder, **options), now_ns=now_ns)
 
 

@@ -168,7 +168,7 @@ async def test_measurements_without_errors_equal_the_ground_truth(tmp_path: Path
             [truth[i]["q_world_segment"][segment] for i in nearest], scalar_first=True
         )
         apart = np.degrees((measured.inv() * expected).magnitude())
-        assert apart.max() < 1.5  # 5 ms of a squat
+        assert apart.max() < 1.5  # rotation of a squat in 5 ms
         assert np.median(apart) < 0.5
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 SENT = bytes(range(256)) * 64
-"""Number of bytes, more than the 4 KB that the kernel passes to a reader at once."""
+"""Bytes that the device sends: more than the 4 KB that the kernel passes to a reader at once."""
 
 
 @pytest.fixture

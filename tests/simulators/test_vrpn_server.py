@@ -136,7 +136,7 @@ async def test_stamps_increase_over_frames_that_are_sent_at_once() -> None:
             await loop.sock_sendall(client, encode(Cookie()))
             while not server.clients:
                 await asyncio.sleep(0.005)
-            for _ in range(3):  # a busy host makes up for time that it lost
+            for _ in range(3):  # a busy host sends several frames at once
                 server.push(0, {}, POSES)
             async with asyncio.timeout(2):
                 while len([item for item in found if isinstance(item, TrackerPose)]) < 6:

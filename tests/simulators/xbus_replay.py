@@ -1,8 +1,8 @@
-"""Xbus device that replays a capture. Invariant: it sends the recorded bytes after the handshake.
+"""Xbus device that replays a capture. Invariant: it sends the recorded bytes.
 
 The handshake is simulated. In measurement mode the recorded messages are sent at the intervals of
-their SampleTimeFine. Messages with the time of another clock (such as a GNSS receiver) are sent
-together with the previous message.
+their SampleTimeFine. Messages with the time of another clock, such as the clock of a GNSS
+receiver, are sent together with the previous message.
 """
 
 from __future__ import annotations

@@ -57,7 +57,7 @@ class Running:
 
     @contextlib.asynccontextmanager
     async def run(self) -> AsyncIterator[Running]:
-        """Run the daemon for the block."""
+        """Run the daemon for the duration of the ``async with`` block."""
         self.daemon = Daemon(self.folder / "rig.toml", parse_rig(self.table), Core())
         self.daemon._core.subscribe(self)
         outgoing = self.daemon._outbox.respond
@@ -118,7 +118,7 @@ class Running:
 def gateway_fixture(
     table: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Running:
-    """Return a daemon of two sensors with two stored calibrations; not started."""
+    """Return a daemon of two sensors with two stored calibrations, which is not started yet."""
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
     rig = {
         "rig": table["rig"],

@@ -233,7 +233,7 @@ async def test_a_calibration_on_a_full_disk_is_published_and_stored_when_there_i
             daemon._core.feed(Request(1, "calibrate", "t", {}))
             while daemon._calibrations.fault is None:
                 await asyncio.sleep(0.01)
-            await asyncio.sleep(0.2)  # some more attempts
+            await asyncio.sleep(0.2)  # time for some more attempts
             assert "File too large" in daemon._calibrations.fault
             published = daemon._outbox.retained["jointfit/bench-1/calibration"]
             assert b"in force but not stored" in published

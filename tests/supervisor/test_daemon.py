@@ -540,8 +540,8 @@ def test_watchdog_trips_only_if_samples_produce_no_state() -> None:
     progress = ProgressMonitor()
     assert progress.has_progressed(counters(0, 0))  # no sample arrives
     assert progress.has_progressed(counters(10, 5))  # states are output
-    assert progress.has_progressed(counters(20, 5, late=10))  # too late for any state
-    assert not progress.has_progressed(counters(40, 5, late=10))  # no output results
+    assert progress.has_progressed(counters(20, 5, late=10))  # the new samples are late
+    assert not progress.has_progressed(counters(40, 5, late=10))  # samples in time, but no state
     assert progress.has_progressed(counters(60, 6, late=10))
     assert progress.has_progressed(CoreHealth(frames=FrameCounts(9, 3, 0)))
 

@@ -1,4 +1,4 @@
-"""Overload warnings: limits, figures and rate, and one warning for each cause."""
+"""Overload warnings: limits, numbers in the text, rate, and one warning for each cause."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ async def test_the_sensor_is_opened_again_and_the_test_follows_it_until_stopped(
         assert (await gateway.ask("physical-test", asked("start"))).data["state"] == "opening"
         await gateway.until(lambda: fakes.started == ["S1", "S2", "S1"])
         sinks = len(gateway.daemon._core._sinks)
-        await gateway.ask("physical-test", asked("start", "S2"))  # ends the first one
+        await gateway.ask("physical-test", asked("start", "S2"))  # ends the first test
         assert len(gateway.daemon._core._sinks) == sinks
         other = await gateway.ask("physical-test", asked("status"))
         assert other.status == "error"

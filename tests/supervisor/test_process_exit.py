@@ -24,7 +24,7 @@ from jointfit_daemon.__main__ import main
 daemon.STOP_S = {LIMIT_S}
 sys.exit(main(["--config", sys.argv[1]]))
 """
-"""The daemon with a shorter limit of the stop."""
+"""Program that runs the daemon with a shorter time limit for the stop."""
 
 
 def test_a_state_directory_that_can_be_written_again_is_created_and_locked(tmp_path: Path) -> None:

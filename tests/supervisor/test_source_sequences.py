@@ -158,9 +158,9 @@ class Supervised(RuleBasedStateMachine):
 
     @rule()
     def change_during_a_restart(self) -> None:
-        """Lose all devices, and repair the first one 0.1 s later.
+        """Lose all devices, and repair the first device 0.1 s later.
 
-        Its port then closes, or its source waits for the retry.
+        At this time its port is closing, or its source waits for the retry.
         """
         for name in NAMES:
             self.ports[name].mood = "lost"
@@ -194,7 +194,7 @@ class Supervised(RuleBasedStateMachine):
 
 @pytest.fixture(autouse=True)
 def no_real_devices(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Disable the waiting for device files, because the ports of these tests have none."""
+    """Disable the waiting for device files, because the ports of these tests have no files."""
     path = "jointfit_daemon.supervisor._source_tasks.device_path"
     monkeypatch.setattr(path, lambda _: None)
 

@@ -1,4 +1,4 @@
-"""Sources after a reload."""
+"""Retries of paused and misconfigured sources, also at a reload."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ async def test_paused_source_is_retried_and_reported_once(
         (closed,) = events
         assert isinstance(closed, SourceClosed)
         assert "add the user to group dialout (retrying" in closed.text
-        assert caplog.text == ""  # the core reports it, also in the log
+        assert caplog.text == ""  # the core reports the fault, which is then logged
         await sources.stop()
 
 

@@ -181,7 +181,7 @@ class Listener:
         return devices
 
     async def final_health(self) -> dict[str, Any]:
-        """Return the devices of a health message with all offline and no waiting samples."""
+        """Wait for health with all devices offline and no waiting samples; return the devices."""
         await self.until(lambda: not self.online)
         return await self.health(
             lambda devices: not any(d["online"] or d["pending"] for d in devices.values())
@@ -311,7 +311,7 @@ async def stopped(
 
 
 def restore_signals() -> None:
-    """Reset the stop signals of a child process, because nohup and `&` ignore signals."""
+    """Enable the stop signals in a child process, which nohup and `&` may have disabled."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
 

@@ -24,7 +24,7 @@ NOISY = (
 WIRES = (("S1",), ("S3",), ("S2", "S4"))
 """Sensors by wire. Corrupt bytes on a bus are counted by one of its sensors."""
 USED = 0.95
-"""Smallest share of received samples that are used, apart from late ones on a loaded machine."""
+"""Smallest share of received samples that are used. On a loaded machine, late samples count too."""
 OVERLOAD = 1.5
 """Load factor above which the processes themselves make many samples late."""
 DROPOUTS = ("--set", "dropout=0.02", "--set", "latency_jitter_ms=3")

@@ -156,17 +156,17 @@ def keys(value: Any) -> Iterator[str]:
 
 
 def documented_words() -> set[str]:
-    """Return all words in code spans and code blocks of the page."""
+    """Return all words in code spans and code blocks of `PAGE`."""
     text = PAGE.read_text(encoding="utf-8")
     spans = re.findall(r"```.*?```|`[^`\n]+`", text, re.DOTALL)
     return set(re.findall(r"\w+", " ".join(spans)))
 
 
 def keys_of_examples() -> set[str]:
-    """Return the keys in the page's examples of payloads."""
+    """Return the keys in the examples of payloads in `PAGE`."""
     text = PAGE.read_text(encoding="utf-8")
     examples = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
-    examples = [body for body in examples if '"sticks"' not in body]  # of another rig
+    examples = [body for body in examples if '"sticks"' not in body]  # a planar rig
     return set(re.findall(r'"(\w+)":', " ".join(examples))) - NAMES
 
 
@@ -215,7 +215,7 @@ def count_phases_in_the_log(run: CalibratedRun) -> None:
 
 def judge_the_optical_reference(run: CalibratedRun) -> None:
     rate_hz = (len(run.optical) - 1) / (run.optical[-1]["t_us"] - run.optical[0]["t_us"]) * 1e6
-    assert 10 < rate_hz <= 25.5  # a pause while the daemon reloads
+    assert 10 < rate_hz <= 25.5  # includes the pause of the reload
     knees = [payload["joints"]["knee"] for payload in run.optical]
     compared = [knee for knee in knees if knee["residual"] is not None]
     assert len(compared) > 0.5 * len(knees)

@@ -1,6 +1,7 @@
-"""A rig of four IMU families with each family of cameras: the accuracy and account of the demo.
+"""A rig of four IMU families meets the targets of the demo with each family of cameras.
 
-Each run takes more than a minute of real time, so CI runs one: `make test-cameras` runs all.
+Each run takes more than a minute of real time, so CI runs only one of them. `make test-cameras`
+runs all.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(300)]
 
-# Two on UARTs and two on CAN. Data that a device sends before the first reply of its handshake are
-# discarded. These devices are silent before the handshake, or have no handshake.
+# Two sensors use UARTs, and two use CAN. Drivers discard data that a device sends before the first
+# reply of its handshake. These devices send nothing before the handshake, or have no handshake.
 FAMILIES = {"S1": "bno085", "S2": "lpms-can", "S3": "serial-table", "S4": "can-table"}
 
 
@@ -34,7 +35,7 @@ async def test_four_families_meet_the_targets_of_the_demo_with_each_camera_syste
     options += ["--mocap", cameras]
     figures, stopped = await _run(tmp_path, 8.0, "leg", options, headless=True, picture=None)
     assert stopped is None
-    # Other experiments run beside this one; tests/system/test_timing_end_to_end.py tests latency.
+    # Other experiments run at the same time; tests/system/test_timing_end_to_end.py tests latency.
     assert [text for text in missed_targets(figures) if not text.startswith("latency")] == []
     assert figures["corrupt"] == 0
     rig = (tmp_path / "rig.toml").read_text(encoding="utf-8")

@@ -1,4 +1,5 @@
-"""The dashboard with the daemon and simulated hardware: calibration with cameras, and cost.
+"""The dashboard with the daemon and simulated hardware: calibration with cameras, and the
+processor time and memory of the page and its server.
 
 The run writes screenshots of every view and the measured cost (``cost.json``) to
 ``build/dashboard``.
@@ -148,7 +149,7 @@ async def revert(page: OpenedPage) -> None:
 
 
 async def see_the_limb_move(page: OpenedPage) -> None:
-    """Wait until the limb from IMUs and cameras walks."""
+    """Wait until the page shows a walking limb, measured by IMUs and by cameras."""
     await page.show("live")
     await page.until_text("#angle-value", "°")
     await page.page.wait_for_selector("#legend-optical", state="visible")
@@ -176,7 +177,7 @@ async def record(page: OpenedPage) -> str:
 
 
 async def turn_a_sensor(page: OpenedPage, simulator: Simulator) -> None:
-    """Turn a simulated sensor while the subject stands; its axes must follow."""
+    """Turn a simulated sensor while the subject stands; its axes on the page must follow."""
     await page.show("sensors")
     await page.until_text("#view-sensors .turn", "turned")
     async with asyncio.timeout(60):

@@ -59,7 +59,7 @@ async def test_a_hand_that_follows_the_page_gets_the_lines_for_rig_toml(
             assert "S1 sends: components w x y z, world to sensor" in found
             assert await page.accessibility_faults() == []
 
-            # The other sensor is absent, which is stated in words.
+            # Sensor S2 is absent, and the page reports this.
             await page.page.select_option("#tested-sensor", "S2")
             await page.page.click("text=Start the test")
             await page.until_text("#physical-test .test-status.bad", "is not there", 30.0)

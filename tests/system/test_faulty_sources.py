@@ -1,4 +1,4 @@
-"""A rig with a fault at almost every source: the daemon reports each with its remedy."""
+"""A rig with a fault at almost every source: the daemon reports each fault with its remedy."""
 
 from __future__ import annotations
 
@@ -199,7 +199,7 @@ async def plugged_in(folder: Path) -> AsyncIterator[FaultyHardware]:
     hardware = FaultyHardware(folder)
     running = asyncio.create_task(hardware.run(), name="hardware")
     held = os.open(folder / "taken", os.O_RDWR | os.O_NOCTTY)
-    fcntl.flock(held, fcntl.LOCK_EX)  # as a program that uses the port
+    fcntl.flock(held, fcntl.LOCK_EX)  # like another program
     try:
         yield hardware
     finally:

@@ -1,4 +1,4 @@
-"""Restarts and losses of the processes around the daemon, and its own stop."""
+"""Stop of the daemon, and restarts and losses of the broker and the simulator around it."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ async def test_daemon_connects_to_a_late_broker_and_reconnects_to_a_restarted_on
 
         for _ in range(2):
             listener.latest.clear()
-            broker.start()  # without retained messages, since it was killed
+            broker.start()  # the retained messages were lost
             await listener.connected(SOURCES)
             await listener.more_poses(50)
             retained = await read_retained(broker.port)

@@ -46,7 +46,7 @@ async def test_lost_and_exchanged_markers_are_flagged_and_the_rest_is_tracked(
 async def lose_and_exchange_markers(
     simulator: Simulator, listener: Listener
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Hide a marker and exchange two labels, then end both; return a payload of each state."""
+    """Hide a marker and exchange two labels; return a payload with and one without these faults."""
 
     def flags() -> list[str]:
         found: list[str] = listener.latest["optical/chain"]["flags"]
@@ -58,7 +58,7 @@ async def lose_and_exchange_markers(
     await listener.until(lambda: {"lost:F2", "exchanged:T1~T3"} <= set(flags()))
     await listener.event("T1", "T1 and T3 look exchanged")
 
-    # the next frame in which the cameras see both is fitted without them
+    # Wait for a later frame in which T1 and T3 are visible but excluded from the fit.
     excluded_us = listener.latest["optical/chain"]["t_us"]
 
     def is_later_with_both(payload: dict[str, Any]) -> bool:
@@ -76,7 +76,7 @@ async def lose_and_exchange_markers(
 
 
 async def reload_another_model(station: Station, daemon: ChildProcess, listener: Listener) -> None:
-    """Check that a model with a marker on the wrong segment is refused, and the old one tracked."""
+    """Check that a model with a marker on another segment is refused and the old model is used."""
     model = station.rig.with_name("leg.toml")
     text = model.read_text()
     thigh = 'name = "T2"\nsegment = "thigh"'

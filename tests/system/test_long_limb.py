@@ -48,7 +48,7 @@ CHAIN = (
 @contextlib.asynccontextmanager
 async def playing(folder: Path, port: int) -> AsyncIterator[Scene]:
     knobs = apply_settings(perfect(Knobs()), SETTINGS)
-    rig = RigOptions(mqtt_port=port, mqtt_base=BASE, axes="static")  # the truth's axes
+    rig = RigOptions(mqtt_port=port, mqtt_base=BASE, axes="static")  # axes of the log
     options = SceneOptions(folder, wires=WIRES, rig=rig)
     subject = SimulatedSubject(knobs, parse_motion_script("stand"), sensors=SENSORS)
     scene = Scene(knobs, subject, options, now_ns=time.monotonic_ns())

@@ -1,6 +1,6 @@
 """A long run with calibration, reconnection, reload and online learning, replayed exactly.
 
-It takes four minutes; the environment variable ``JOINTFIT_RUN_S=600`` makes it ten.
+The run takes four minutes. With the environment variable ``JOINTFIT_RUN_S=600``, it takes ten.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(1500)]
 
 RUN_S = float(os.environ.get("JOINTFIT_RUN_S", "250"))
-"""Duration of the run, s: online learning refits after three minutes."""
+"""Duration of the run, s. Online learning refits the models after three minutes."""
 MOTION_S = 10.0
 """Duration of each motion, s."""
 

@@ -68,7 +68,7 @@ async def playing(
         output_rate_hz=OUTPUT_HZ,
         mqtt_port=port,
         mqtt_base=BASE,
-        axes="static",  # the truth's axes
+        axes="static",  # the axes of the truth log
     )
     subject = SimulatedSubject(knobs, parse_motion_script("stand"), sensors=sensors, limb=limb)
     scene = Scene(knobs, subject, SceneOptions(folder, rig=rig), now_ns=time.monotonic_ns())

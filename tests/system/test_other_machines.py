@@ -1,4 +1,4 @@
-"""The daemon runs on machines unlike this one, each made of namespaces and the environment."""
+"""The daemon runs on other machines, which namespaces and environment variables simulate."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 pytestmark = [pytest.mark.experiment, pytest.mark.system, pytest.mark.timeout(300)]
 
 YEARS_S = 20 * 365 * 86400
-"""Uptime beyond 2**53 ns, above which a double does not hold every nanosecond."""
+"""Uptime above 2**53 ns, s. A double cannot represent every nanosecond of such times."""
 NO_IPV4 = 'ip link set lo up && ip -4 address flush dev lo && exec "$@"'
 NO_HOSTS = 'mount --bind /dev/null /etc/hosts && exec "$@"'
 
@@ -63,7 +63,7 @@ def test_the_daemon_runs_in_the_locale_c() -> None:
 
 
 def test_the_daemon_runs_in_turkish(tmp_path: Path) -> None:
-    # "I" has another lower-case letter, and the decimal sign is a comma
+    # In Turkish, "I" has another lower-case letter, and the decimal sign is a comma.
     if shutil.which("localedef") is None or not Path("/usr/share/i18n/locales/tr_TR").is_file():
         pytest.skip("no sources of locales (Debian: apt install locales)")
     words = ["localedef", "-i", "tr_TR", "-f", "UTF-8", str(tmp_path / "tr_TR.UTF-8")]

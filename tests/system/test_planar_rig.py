@@ -25,7 +25,7 @@ async def test_joints_of_a_planar_movement_without_sensors(tmp_path: Path, broke
         assert listener.client is not None
         await listener.client.subscribe("optical/sticks")
         await wait_for_small_errors(listener)
-        figures = [await next_figure(listener) for _ in range(60)]  # several times an occlusion
+        figures = [await next_figure(listener) for _ in range(60)]  # longer than an occlusion
 
         await simulator.send_command("hide T4")
         await listener.until(lambda: only_the_hip_lacks(listener, "thigh: T4 not visible"))

@@ -1,4 +1,4 @@
-"""A rig of four boards that tables alone describe: the accuracy and the account of the demo."""
+"""A rig of four boards that only tables describe meets the targets of the demo."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ async def test_four_boards_described_by_tables_meet_the_targets_of_the_demo(tmp_
     options = [word for name, driver in FAMILIES.items() for word in ("--imu", f"{name}={driver}")]
     figures, stopped = await _run(tmp_path, 8.0, "leg", options, headless=True, picture=None)
     assert stopped is None
-    # Other experiments run beside this one; another test tests the latency.
+    # Other experiments run at the same time, and another test tests the latency.
     assert [text for text in missed_targets(figures) if not text.startswith("latency")] == []
     assert figures["corrupt"] == 0
     rig = (tmp_path / "rig.toml").read_text(encoding="utf-8")

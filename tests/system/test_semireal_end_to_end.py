@@ -40,7 +40,7 @@ def test_recorded_squats_through_the_daemon_match_the_offline_errors(
         assert live.recorded == FRAMES
         assert live.frames >= 0.9 * FRAMES
         assert live.errors == pytest.approx(live.offline, abs=0.1), method
-        if method == "patent12":  # in the procedure of the patent
+        if method == "patent12":  # the method with the regression of the patent
             assert live.repeated_deg is not None
             assert live.repeated_deg < 0.01
         else:
@@ -52,5 +52,5 @@ def test_recorded_squats_through_the_daemon_match_the_offline_errors(
         assert sum(device["corrupt"] for device in devices.values()) == 0
         assert live.calibration.method == method
         assert live.calibration.joint["knee"].source == "fit"
-        if method == "patent12":  # the other method corrects headings, the published one does not
+        if method == "patent12":  # without the correction of headings
             assert live.offline == pytest.approx(PUBLISHED, abs=0.1)

@@ -83,7 +83,7 @@ def share_with(poses: list[dict[str, Any]], flag: str) -> float:
 async def test_failed_stuck_and_slipped_sensors_are_reported_and_excluded_until_they_work_again(
     tmp_path: Path, broker: Broker
 ) -> None:
-    calibration = fitted(bench_rig())  # of the same simulated wearer
+    calibration = fitted(bench_rig())  # of the subject in the simulator
     options = ("--seed", "1", "--no-mocap", "--programme", "walk:600")
     station = Station(tmp_path, broker.port, options=options)
     async with station.simulator() as simulator:

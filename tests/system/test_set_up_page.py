@@ -31,7 +31,7 @@ TYPED = {
     "ids.shank-front": "0x105 0x106 0x121",
     "username": "gateway",
 }
-"""Answers without a suitable proposal; the name is refused at first."""
+"""Answers to questions without a suitable proposal; the first answer to `name` is refused."""
 PASSWORD = "Zx9-geheim"
 
 
@@ -46,7 +46,7 @@ async def served(folder: Path) -> AsyncIterator[tuple[SetUpServer, str]]:
 
 
 async def answer(page: OpenedPage, server: SetUpServer) -> str | None:
-    """Answer the present question; return its name, None if there is none."""
+    """Answer the current question; return its name, or None if no question is left."""
     assert server.session is not None
     question = server.session.handle({"do": "show"})["question"]
     if question is None:

@@ -39,7 +39,7 @@ async def test_every_synced_frame_has_correct_time(tmp_path: Path, broker: Broke
     frames = [frame.unexcused_ns for frame in found.core.frames if frame.synced]
     assert len(frames) > 300
     assert max(frames) <= MOST_ERROR_NS
-    # Stamps of unsettled clocks are wrong, and the evaluation detects it.
+    # Some stamps of unsettled clocks are wrong, and the evaluation detects this.
     unsynced = [s.error_ns for s in found.core.samples if not s.synced and s.error_ns is not None]
     assert max(map(abs, unsynced)) > MOST_ERROR_NS
 

@@ -1,4 +1,4 @@
-"""Rotated sensor worlds, occluded markers and NaN: aligned by the calibration, or flagged."""
+"""Rotated sensor worlds are aligned or flagged, despite occluded markers and NaN."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ async def record_phase(
 
 
 async def functional(simulator: SpoiledScene, listener: Listener) -> Any:
-    """Record the functional phase with all markers occluded for a second."""
+    """Record the functional phase, with all markers occluded for 1 s; return the final status."""
     occlusion = asyncio.create_task(occlude(simulator, 4.0), name="occlusion")
     try:
         return await record_phase(simulator, listener, "functional", "functional", 10.0)
@@ -91,7 +91,7 @@ async def occlude(simulator: SpoiledScene, after_s: float) -> None:
 
 
 async def pose_after(listener: Listener, status: Any) -> dict[str, Any]:
-    """Return a pose of an instant after `status`: a retained message overtakes queued poses."""
+    """Return a pose later than `status`, because a retained message overtakes queued poses."""
     (pose,) = await listener.poses_after(status["t_us"])
     return pose
 
@@ -125,7 +125,7 @@ async def test_sensor_worlds_a_right_angle_apart_are_aligned_or_flagged_as_assum
 
 
 async def calibrate_twice(station: Station, simulator: SpoiledScene) -> None:
-    """Calibrate without an align phase, then with it, and check flag and error."""
+    """Calibrate without and then with an align phase; check the heading flag and the knee error."""
     async with station.daemon(), listening(station.port) as listener:
         await listener.connected({*SENSORS, "mocap"})
         facts = orjson.loads((station.folder / "truth.jsonl").read_bytes().split(b"\n", 1)[0])

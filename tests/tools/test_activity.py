@@ -1,4 +1,4 @@
-"""The activity bar: shown on a terminal, absent from pipes, removed after an error."""
+"""The activity bar is shown on a terminal, is absent from pipes, and passes errors on."""
 
 from __future__ import annotations
 
@@ -31,13 +31,14 @@ def test_a_terminal_shows_the_label_and_the_elapsed_time() -> None:
         while True:
             try:
                 shown += os.read(parent, 4096)
-            except OSError:  # the program ended
+            except OSError:  # the program has ended
                 break
     os.close(parent)
     assert process.returncode == 0
     assert b"fitting" in shown
     assert b"0:00:00" in shown
-    assert re.search(rb"\r\x1b\[2K\[1/2\] a line\r\n", shown)  # not behind the bar
+    # The bar is erased before the line is printed.
+    assert re.search(rb"\r\x1b\[2K\[1/2\] a line\r\n", shown)
 
 
 def test_a_pipe_receives_the_lines_only() -> None:

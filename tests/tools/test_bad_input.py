@@ -1,7 +1,7 @@
-"""Every command with every type of bad input: exit code 1 or 2, object, remedy, no traceback.
+"""Every command ends with exit code 1 or 2 on bad input, and names the faulty object and a remedy.
 
-The table combines commands and types of damage. A command may succeed if the damaged file is still
-usable.
+The tests combine all commands with all types of damage. A command may succeed if the damaged file
+is still usable.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ OBJECTS = ("--parent", "marker", "trials", "refused")
 LIBRARY_TEXT = ("could not convert", "codec can't", "allow_pickle", "reshape", "Errno", "[code:",
                 "unpack requires", "C3D magic", "no element found", "not well-formed", "CRC-32",
                 "zip file", "NoneType", "Traceback", "array of size")  # fmt: skip
-"""Library messages that do not help a user."""
+"""Parts of library messages that do not help a user."""
 
 
 @pytest.fixture(scope="module")
@@ -136,16 +136,19 @@ def in_the_sample(sample: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def fault_of(words: Sequence[str], *named: str) -> str:
-    """Run a command; return its message, which names the object and a remedy, or ""."""
+    """Run a command; return its error message, or an empty text if the command succeeds.
+
+    The message must contain one of the texts `named`, and no text of a library.
+    """
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # a warning of a library is also raw text
+        warnings.simplefilter("error")  # a warning of a library does not help a user either
         result = run(app, list(words))
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     if result.exit_code == 0:
         return ""
     assert result.exit_code in (1, 2)
-    message = result.stderr or result.stdout  # refused requests are part of the output
+    message = result.stderr or result.stdout  # some commands print a refusal on stdout
     assert any(name in message for name in named), message
     assert not [word for word in LIBRARY_TEXT if word in message], message
     assert "Warning" not in message
@@ -207,8 +210,8 @@ def test_output_files_are_checked_before_the_work(
     def work(*_: object, **__: object) -> None:
         raise AssertionError("the work began")
 
-    # Replace the functions in the modules that use them. A module imported meanwhile would keep the
-    # substitute.
+    # Replace the functions only in the modules that use them. If the defining modules were changed,
+    # a module imported during the test would retain the replacement.
     for reader in ("jointfit_daemon.tools.markers._trials.read_marker_trial",
                    "jointfit_daemon.tools.fuse._trial.read_recording",
                    "jointfit_daemon.files.mocap.read_marker_trial",

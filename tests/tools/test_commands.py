@@ -1,4 +1,4 @@
-"""The commands as a user types them: answers on stdout, faults with their remedy, exit codes."""
+"""All commands print results on stdout and faults with a remedy on stderr, and set exit codes."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_every_command_with_a_result_prints_it_as_json_on_request(command: str) 
 
 
 def completions(*words: str) -> list[str]:
-    """Return the completions that bash offers if Tab follows the words."""
+    """Return the completions that bash offers if the user types `words` and the Tab key."""
     line = " ".join(map(shlex.quote, ("jointfit", *words)))
     script = f"""
         . {COMPLETION}

@@ -1,4 +1,4 @@
-"""`jointfit decode` on real captures: exactly the counts in the documents of the recordings."""
+"""`jointfit decode` finds in real captures exactly the counts that their documents state."""
 
 from __future__ import annotations
 
@@ -52,13 +52,15 @@ def test_the_xsens_captures_hold_a_hundred_messages_each(
         "quaternions": quaternions,
         "first_quaternion": FIRST if quaternions else None,
         "last_quaternion": LAST if quaternions else None,
-        "time_resets": 0,  # although the time of all messages decreases four
+        # The device time decreases four times, but only in messages without orientation, which the
+        # driver ignores.
+        "time_resets": 0,
         "counter_gaps": 0,
     }
 
 
 def frame_at(wire: bytes, number: int) -> int:
-    """Return the position at which frame `number` (from 0) begins."""
+    """Return the byte position at which message `number` (from 0) begins."""
     frames = [event for event in XbusCodec().feed(wire) if isinstance(event, XbusMessage)]
     return sum(len(encode(m.mid, m.data, m.bid)) for m in frames[:number])
 
@@ -68,7 +70,7 @@ def flipped(wire: bytes) -> bytes:
 
 
 def inserted(what: bytes) -> Callable[[bytes], bytes]:
-    """Return a function that inserts bytes before frame 50 (the fifty-first)."""
+    """Return a function that inserts bytes before message number 50 (from 0)."""
 
     def cut(wire: bytes) -> bytes:
         at = frame_at(wire, 50)
@@ -83,7 +85,10 @@ def long_tenth(wire: bytes) -> bytes:
 
 
 def begun_inside(number: int, from_end: int) -> Callable[[bytes], bytes]:
-    """Return a function that starts a capture `from_end` bytes before the end of a frame."""
+    """Return a function that omits the start of a capture.
+
+    The remaining capture begins `from_end` bytes before the end of message `number` (from 0).
+    """
     return lambda wire: wire[frame_at(wire, number + 1) - from_end :]
 
 
@@ -276,7 +281,7 @@ def test_an_empty_capture_and_a_capture_of_another_device_are_named(
 
 def test_a_message_by_chance_does_not_hide_the_device_of_a_capture(tmp_path: Path) -> None:
     file = tmp_path / "other.bin"
-    device_message = bytes.fromhex("FA FF 31 00 D0")  # acknowledgement without content
+    device_message = bytes.fromhex("FA FF 31 00 D0")  # GotoConfigAck, a message without content
     file.write_bytes(device_message + 400 * b"\x55\x51\x00\x01")
     result = run(app, ["decode", "xbus", str(file)])
     assert "messages" in result.stdout

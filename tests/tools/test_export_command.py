@@ -1,4 +1,4 @@
-"""`jointfit export`: recordings and files to every format, its notes, and its refusals."""
+"""`jointfit export` writes recordings and files in other formats, and refuses wrong input."""
 
 from __future__ import annotations
 
@@ -58,7 +58,8 @@ def test_a_file_is_converted_and_the_files_are_printed(trial: Path, tmp_path: Pa
     assert printed == [str(out / "walk_sensors.sto"), str(out / "walk_segments.sto")]
     assert "resampled to 100 Hz by interpolation: S2" in result.stderr
     first, second = read_session(out / "walk_sensors.sto").sensors
-    # The file begins when the second sensor starts, 2 ms after the first: IMUPlacer needs both.
+    # The file begins when the second sensor starts, 2 ms after the first sensor, because IMUPlacer
+    # needs both sensors.
     assert first.t_s[0] == pytest.approx(3.01)
     assert np.isfinite(first.orientation[0]).all()
     assert np.isfinite(second.orientation[0]).all()

@@ -1,4 +1,4 @@
-"""Markers of a recorded NatNet server in TRC and C3D files, read by other programs."""
+"""OpenSim and ezc3d read the markers of a recorded NatNet server from the exported files."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ VELOCITY = (0.3, -0.2, 0.1)
 
 
 def record_cameras(folder: Path) -> Path:
-    """Record a core that is fed with the datagrams of a server, and return the recording."""
+    """Record the processing of the datagrams of a server; return the path of the recording."""
     table = core_feed.table()
     table["mocap"] = {
         "driver": "natnet",
@@ -80,7 +80,7 @@ def record_cameras(folder: Path) -> Path:
 
 
 def read_trc(path: Path) -> tuple[list[str], Array, Array]:
-    """Return labels, instants and positions in the axes of our world, read by OpenSim."""
+    """Return labels, times (s) and positions (m, z up) that OpenSim reads from a TRC file."""
     opensim: Any = pytest.importorskip("opensim")
     table = opensim.TimeSeriesTableVec3(str(path))
     flat = table.flatten()
@@ -90,7 +90,7 @@ def read_trc(path: Path) -> tuple[list[str], Array, Array]:
 
 
 def read_c3d(path: Path) -> tuple[list[str], Array, Array]:
-    """Return labels, instants and positions, read by ezc3d."""
+    """Return labels, times (s) and positions (m, z up) that ezc3d reads from a C3D file."""
     ezc3d: Any = pytest.importorskip("ezc3d")
     file = ezc3d.c3d(str(path))
     point = file["parameters"]["POINT"]

@@ -1,4 +1,4 @@
-"""Every flag of a pose has the same sentence in the terminal and on the dashboard's page."""
+"""Every flag of a pose has the same sentence in the terminal and in the dashboard's page."""
 
 from __future__ import annotations
 

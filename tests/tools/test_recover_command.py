@@ -1,4 +1,4 @@
-"""`jointfit recover` writes a clean file, lists the gaps, and does not change its source."""
+"""`jointfit recover` writes a clean file, lists the gaps, and does not change the damaged file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`jointfit request`, `mark` and the versions of `calibrate`, against a daemon and a broker."""
+"""`jointfit request`, `mark`, and `calibrate` with stored versions send requests to a daemon."""
 
 from __future__ import annotations
 

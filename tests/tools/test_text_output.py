@@ -1,4 +1,4 @@
-"""Text output that the commands share."""
+"""`echo_wrapped` wraps long lines on a terminal only."""
 
 from __future__ import annotations
 

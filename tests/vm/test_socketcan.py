@@ -112,7 +112,7 @@ async def test_kernel_filters_pass_only_configured_identifiers(wire: PythonCanWi
     other = XcdiDevice(wire, XcdiDeviceOptions(ids=id_block(0x300)))
     async with shared_bus(BUS) as bus, running(driver) as heard:
         device = XcdiDevice(wire)
-        identity(device, 1)  # until each device has sent what it should, nothing is filtered
+        identity(device, 1)  # the filters are set after the first sample
         await heard.wait_for(1)
         identity(other, 20)
         identity(device, 20, first=1)
@@ -141,7 +141,7 @@ async def test_stamps_are_the_kernels_not_those_of_the_read(wire: PythonCanWire)
         after = time.monotonic_ns()
         time.sleep(0.2)  # noqa: ASYNC251 - the loop is to stall
         await heard.wait_for(11)
-        slack = 1_000_000  # back-dating by a frame, two clocks
+        slack = 1_000_000  # errors of back-dating and of clock conversion
         stamps = [sample.arrival_ns for sample in heard.samples[1:]]
         assert all(before - slack <= stamp <= after + slack for stamp in stamps)
         assert stamps == sorted(stamps)
@@ -150,7 +150,8 @@ async def test_stamps_are_the_kernels_not_those_of_the_read(wire: PythonCanWire)
 async def test_frames_that_the_kernel_dropped_are_counted_exactly(wire: PythonCanWire) -> None:
     async with running(XcdiImu(settings(silence_s=10))) as heard:
         device, burst = XcdiDevice(wire), 3000
-        identity(device, burst)  # the loop does not run meanwhile: 12 000 frames into one queue
+        # The event loop does not run during the burst, so one queue receives 12 000 frames.
+        identity(device, burst)
 
         def arrived() -> int:
             return sum(not frame.error for frame in heard.frames)

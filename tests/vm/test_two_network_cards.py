@@ -35,7 +35,7 @@ def do(*words: str) -> None:
 
 @pytest.fixture(scope="module")
 def peer() -> Iterator[None]:
-    """A server behind v0 (10.7.0.1), and a second card w0 (10.7.0.5) in the same network."""
+    """Run a server behind card v0 (10.7.0.1); add a second card w0 (10.7.0.5) to its network."""
     other = subprocess.Popen(["/usr/bin/unshare", "-n", "/bin/sleep", "600"])
     own = Path("/proc/self/ns/net").readlink()
     while Path(f"/proc/{other.pid}/ns/net").readlink() == own:

@@ -98,7 +98,7 @@ def settings(name: str = "S3", **more: Any) -> XcdiSettings:
 
 
 class ReceivedFrames:
-    """Everything a driver emitted, decoded."""
+    """Frames that a driver emitted, and the decoded events."""
 
     def __init__(self, driver: Driver) -> None:
         self.decoder: Any = driver.decoder()

@@ -1,11 +1,11 @@
 #!/bin/sh
-# Inside the virtual machine, as root: bring up buses, broker and package, run the tests, leave what they said.
+# Inside the virtual machine, as root: bring up buses, broker and package, run the tests, store their log.
 set -e
 cd /mnt
 mount -t hostfs none /lib/modules -o /usr/lib/uml/modules
 modprobe -a vcan can-raw
 
-# A network: nobody answers on it, but packets to everywhere have a way out of the machine.
+# A network without other hosts, so that every address has a route.
 modprobe dummy
 ip link add lab type dummy
 ip addr add 192.168.77.1/24 dev lab
@@ -22,7 +22,7 @@ for unit in jointfitd jointfitd@; do
     install -D -m 644 -t /etc/systemd/system/$unit.service.d /usr/share/jointfitd/systemd/jointfitd-can.conf
 done
 
-# A broker as docs/security.md sets it up: TLS with a CA of our own, passwords, the shipped rights.
+# A broker as docs/security.md sets it up: TLS with a private CA, passwords, the shipped access list.
 certs=/etc/mosquitto/certs
 openssl req -x509 -newkey rsa:2048 -nodes -days 2 -subj "/CN=test CA" -keyout $certs/ca.key -out $certs/ca.crt 2>/dev/null
 openssl req -newkey rsa:2048 -nodes -subj "/CN=localhost" -keyout $certs/broker.key -out $certs/broker.csr 2>/dev/null

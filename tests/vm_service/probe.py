@@ -1,4 +1,4 @@
-"""Runs instead of the daemon under its unit, and tries operations that the unit must forbid.
+"""Program that the unit starts instead of the daemon; it tries operations that the unit restricts.
 
 It prints one JSON object with the errno of every operation, or 0 if the operation succeeded.
 """

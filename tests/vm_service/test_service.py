@@ -77,7 +77,7 @@ def collect(phase: str, wanted: str, **arguments: object) -> None:
 
 
 def squatting() -> list[dict[str, Any]]:
-    """Return some successive poses, in which the knee bends if the angles are available."""
+    """Return 100 successive poses if the knee bends by more than 30 deg, else an empty list."""
     poses = messages("pose", count=100, seconds=30)
     knees = [pose["joints"]["knee"]["flexion_deg"] for pose in poses]
     known = [angle for angle in knees if angle is not None]

@@ -1,4 +1,4 @@
-"""Driver for Bosch / CEVA BNO085 and BNO086 on a serial port, modes UART-RVC and UART-SHTP."""
+"""Driver for Bosch / CEVA BNO085 and BNO086 on a serial port, mode UART-RVC or UART-SHTP."""
 
 from jointfit_drivers.bno085._driver import Bno085Imu
 from jointfit_drivers.bno085._rvc_decoder import RvcDecoder

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Bno085Imu:
-    """One BNO085 or BNO086: orientation and an 8-bit sample number, without device time."""
+    """One BNO085 or BNO086, which sends orientations with an 8-bit number and no device time."""
 
     Settings: ClassVar[type[Bno085Settings]] = Bno085Settings
     wire: ClassVar[Wire] = "stream"
@@ -49,8 +49,8 @@ class Bno085Imu:
             The port is absent, in use, unplugged, or silent for ``lost_after_s``. A retry may
             succeed.
         DeviceMisconfiguredError
-            The file is not a serial port, or the device is of another kind, in another mode, or
-            does not accept the rate.
+            `port` is not a serial port, or the device is of another kind, in another mode, or does
+            not accept the rate.
         """
         settings = self._settings
         ensure = ensure_rvc if settings.baud == RVC_BAUD else ensure_shtp

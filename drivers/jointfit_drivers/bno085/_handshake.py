@@ -3,7 +3,7 @@
 In the mode UART-RVC, the device sends without a request and ignores the host. In the mode
 UART-SHTP, it is silent after a reset. The driver reads the settings of the reports, and changes
 only settings that differ from rig.toml. The device loses these settings at the next reset, because
-the driver does not store them.
+the driver does not store them in the device.
 
 Source: BNO08X data sheet 1000-3927, section 1.3.1. Bytes to the device must be separated by 100 us.
 """
@@ -66,7 +66,7 @@ class ShtpConversation(SerialConversation[ShtpPacket | ShtpBufferStatus]):
             await asyncio.sleep(_BYTE_PAUSE_S)
 
     async def control(self, data: bytes, *, tries: int) -> bytes | None:
-        """Send a request on the control channel, and return its reply; None if none arrives.
+        """Send a request on the control channel, and return its reply; None if no reply arrives.
 
         The reply to a request for the product id is the product id. The reply to a request for a
         report is the settings of the report.

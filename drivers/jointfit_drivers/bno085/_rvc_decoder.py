@@ -11,9 +11,10 @@ roll 20.85 degrees with accelerations of -371, -20 and 977 mg. With pitch about 
 .. math:: R = R_z(\text{yaw})\, R_x(\text{pitch})\, R_y(\text{roll}), \qquad
     R^T e_z = (-0.356, -0.019, 0.934),
 
-which agrees with the measured direction (-0.355, -0.019, 0.935). With ``zyx`` the direction is
-(0.019, 0.356, 0.934). The default is therefore ``zxy``. The decoder also compares both orders
-with the accelerations at rest, and warns if the other order fits better.
+where e_z is the unit vector upwards. This direction agrees with the direction of the measured
+acceleration, (-0.355, -0.019, 0.935). With ``zyx`` the direction is (0.019, 0.356, 0.934). The
+default is therefore ``zxy``. The decoder also compares both orders with the accelerations at rest,
+and warns if the order that is not configured fits better.
 
 Invariant: the output depends only on the chunks fed; the decoder reads no clock and no port.
 """
@@ -46,11 +47,12 @@ _MOST_LOST = 128
 _REST = 0.06
 """Largest relative deviation of an acceleration from 1 g at rest."""
 _DISTINCT = 0.2
-"""Smallest distance between the two computed unit vectors of gravity for a comparison."""
+"""Smallest distance at which the upward unit vectors of the two axis orders are compared."""
 _COMPARED = 100
 """Number of frames at rest after which the two orders of axes are compared."""
 _BETTER = 3.0
-"""Smallest ratio of the deviations of the configured and the other order that causes a warning."""
+"""Smallest ratio of the deviation of the configured axis order to the deviation of the other order
+that causes a warning."""
 _G_COUNTS = 1000.0
 
 
@@ -117,7 +119,7 @@ class RvcDecoder(SerialMessageDecoder[RvcFrame]):
 
 
 def quaternion_of(angles: tuple[int, int, int], euler: Literal["zxy", "zyx"]) -> Quaternion:
-    """Return the orientation q_world_sensor of yaw, pitch and roll in 0.01 degrees, z up."""
+    """Return q_world_sensor, world z up, for yaw, pitch and roll in units of 0.01 degrees."""
     (cz, sz), (cp, sp), (cr, sr) = (
         (cos(0.5 * _ANGLE * angle), sin(0.5 * _ANGLE * angle)) for angle in angles
     )

@@ -134,7 +134,7 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         return events + self._newer.take_version(".".join(map(str, firmware[0])))
 
     def _reports(self, packet: ShtpPacket, reports: list[bytes]) -> list[Decoded]:
-        """Return the samples in a packet of measurements."""
+        """Return the samples and events of a packet of measurements."""
         out: list[Decoded] = []
         base = 0
         sent_ns = self._arrival_of(packet)
@@ -160,7 +160,7 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         return out
 
     def _orientation(self, packet: ShtpPacket, report: HubReport) -> list[Decoded]:
-        """Return the sample of a rotation vector.
+        """Return the sample and the events of a rotation vector.
 
         The device sends the components in the order i, j, k, real.
         """
@@ -210,7 +210,10 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         return kind == self._selected
 
     def _step(self, report: HubReport) -> tuple[int, list[Decoded]]:
-        """Return by how much the report number increased, and an event if reports were lost."""
+        """Return the increase of the report number, and an event if reports were lost.
+
+        A decrease of the number counts as an increase by 1.
+        """
         last = self._sequences.get(report.report_id)
         self._sequences[report.report_id] = report.sequence
         step = 1 if last is None else (report.sequence - last) % _COUNTS
@@ -249,7 +252,7 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         """Return the time since the first reading, ns. It advances by the mean period per reading.
 
         The device has no clock, so the period is computed from the arrivals since the first
-        reading.
+        reading. The first `_PERIOD_COUNTS` readings use the nominal period.
         """
         if self._readings == 0:
             self._first_ns, self._readings = self._arrival_ns, 1

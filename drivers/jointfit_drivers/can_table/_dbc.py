@@ -59,8 +59,8 @@ def read_signals(path: str, names: Sequence[str]) -> list[DbcSignal]:
     Raises
     ------
     FieldFaultError
-        The package, the file or a signal is missing, the file is malformed, its signals overlap,
-        or a name is ambiguous.
+        The package `cantools`, the file or a signal is missing, the file is malformed, its signals
+        overlap, or a name is ambiguous.
     """
     if find_spec("cantools") is None:
         raise FieldFaultError("signals", PACKAGE_MISSING)
@@ -159,7 +159,7 @@ def _multiplexer(message: Any, signal: Any) -> Multiplexer | None:
     Raises
     ------
     FieldFaultError
-        The multiplexer has too few bits for all of the values.
+        The multiplexer has too few bits for any of the values.
     """
     if signal.multiplexer_ids is None:
         return None

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class CanTableImu:
-    """One device that sends frames as its table describes."""
+    """One device that sends frames as its ``[[imu]]`` table describes."""
 
     Settings: ClassVar[type[CanTableSettings]] = CanTableSettings
     wire: ClassVar[Wire] = "can"

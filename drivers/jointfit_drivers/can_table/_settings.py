@@ -269,12 +269,12 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
         }
 
     def _multiplexed_signals(self) -> Iterator[tuple[str, int, Multiplexer]]:
-        """Yield quantity, frame and multiplexer of each multiplexed signal of the DBC file."""
+        """Yield quantity, frame index and multiplexer of each multiplexed signal of the file."""
         for quantity, parts in self.fields:
             for part in parts:
                 if self.dbc is None or part.signals is None:
                     continue
-                with suppress(FieldFaultError):  # `places` reports it
+                with suppress(FieldFaultError):  # `places` reports the fault
                     for signal in read_signals(self.dbc, part.signals):
                         if signal.multiplexer is not None:
                             number = self._frame_of_signal(signal.key, quantity, part)

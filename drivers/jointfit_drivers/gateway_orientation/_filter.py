@@ -2,9 +2,9 @@ r"""Computation of the orientation from the raw measurements of one IMU, by the 
 
 VQF stands for "versatile quaternion-based filter". A relative error of the sample interval causes
 the same relative error of every rotation. The interval is therefore computed from the device time
-(`RawReading.t_ns`). The filter has a fixed step, which is the first interval T_s. If the ticks are
-too coarse for one interval, the mean interval differs from the first interval. Angular rates are
-then scaled so that every step rotates by the true angle:
+(`RawReading.t_ns`). The filter has a fixed step, which is the first interval T_s. If the device
+time has a coarse resolution, the mean interval :math:`\bar T` differs from T_s. The angular rate
+:math:`\omega` is therefore scaled so that every step rotates by the true angle:
 
 .. math:: \omega_\text{fed} = \omega\, \bar T / T_s
 
@@ -267,7 +267,10 @@ class GatewayOrientation:
         self._filter.setMotionBiasEstEnabled(not (self._magnetic and self.settling))
 
     def _update(self, reading: RawReading, *, follows: bool = True) -> FilterOutput:
-        """Update the filter with one reading. After a gap, continue with the same heading."""
+        """Update the filter with one reading, and return the output.
+
+        After a gap, `follows` is false. Without magnetometer, the heading then continues unchanged.
+        """
         # w_fed = w T_mean / T_s, so that every step rotates by the true angle.
         scale = self.period_ns / self._period_ns
         x, y, z = reading.rate
@@ -332,7 +335,7 @@ class GatewayOrientation:
         self._continue_start(self._estimator, t_ns)
 
     def _continue_start(self, estimator: StartEstimator, t_ns: int) -> None:
-        """Set the bias of VQF to the estimate; at the end, set all state variables of VQF."""
+        """Set the bias of VQF to the estimate; at the end, copy the complete estimate to VQF."""
         known = estimator.bias_sd <= KNOWN_BIAS_SD
         late = t_ns - self._converging_ns >= CONVERGE_S * NS_PER_S
         if not (known or late or self._filter.getRestDetected()):
@@ -390,9 +393,10 @@ def _field_delay(
 
     .. math:: R m = m_w + d\, R (\omega \times m) ,
 
-    which is a linear regression with a ridge term. The ridge term corresponds to a disturbance of
-    2 % of the field and a delay of 20 ms. If the rotation is so slow that the ridge term dominates,
-    the delay is unknown. Fields of implausible strength are excluded.
+    where R rotates from the sensor to the world, m_w is the field in the world, and :math:`\omega`
+    is the angular rate. A linear regression with a ridge term yields d. The ridge term corresponds
+    to a disturbance of 2 % of the field and a delay of 20 ms. If the rotation is so slow that the
+    ridge term dominates, the delay is unknown. Fields of implausible strength are excluded.
 
     Parameters
     ----------

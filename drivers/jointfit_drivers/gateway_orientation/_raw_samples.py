@@ -130,7 +130,8 @@ class RawSamples:
         stamp
             Arrival, device time and status of the message.
         reading
-            Measurements of the message. Their time must be later than that of the previous reading.
+            Measurements of the message. Their time must be later than the time of the previous
+            reading.
         clipped
             Whether the driver found that a measurement is out of range.
         field_corrected

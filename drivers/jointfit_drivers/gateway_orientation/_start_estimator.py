@@ -3,15 +3,16 @@ r"""Orientation, bias and magnetic field of an IMU whose orientation filter has 
 The orientation filter VQF takes the vertical from a mean over 3 s, and the heading from the field
 relative to that vertical. With a magnetic dip of 70 degrees, the error of the heading is 2.7 times
 the error of the vertical. An unknown bias rotates heading and vertical, and VQF does not use the
-field to estimate the bias. This Kalman filter estimates vertical, heading and bias together from
-gravity and field, in steps of `STEP_S`. The state of the filter is
+field to estimate the bias. The Kalman filter of this module estimates vertical, heading and bias
+together from gravity and field, in steps of `STEP_S`. The state of the filter is
 
 .. math:: (\varphi, b, v, B_n, B_u)
 
 The components are the error of the orientation, rad, in the world; the bias, rad/s; the velocity
 relative to its mean, m/s; and the north and up components of the field. :math:`R` is the
 orientation integrated from the angular rates with the assumed bias :math:`\hat b`. f is the
-specific force, and T the interval of the readings. The sums extend over the readings of a step:
+specific force, and T the interval of the readings. The sums extend over the readings of a step. The
+vector g is gravity, upwards, and :math:`\Delta t` is the length of the step:
 
 .. math::
 
@@ -19,9 +20,9 @@ specific force, and T the interval of the readings. The sums extend over the rea
     v &\leftarrow v + \sum R f\,T - g\,\Delta t + \varphi \times \sum R f\,T
 
 There are two observations: the velocity of a body part is limited, and the mean field of the step
-is :math:`\bar y = B + B \times \varphi`. In both observations, a deviation lasts for about a
-second. The variance of one step is therefore the variance of the deviation times `LASTING_S`,
-divided by the length of the step.
+is :math:`\bar y = B + B \times \varphi` with :math:`B = (0, B_n, B_u)`. In both observations, a
+deviation lasts for about a second. The variance of one step is therefore the variance of the
+deviation times `LASTING_S`, divided by the length of the step.
 
 Invariant: the result depends only on the readings added. The module uses no clock, no device and no
 other filter.

@@ -1,4 +1,4 @@
-"""Detection of losses in a stream without time and counter, from the arrival times alone.
+"""Detection of losses in a stream without device time and counter, from the arrival times alone.
 
 The delay of a sample is its arrival minus the arrival expected from the nominal rate. A lost sample
 increases the delays of all later samples by a whole period. A busy bus or host increases the delays
@@ -32,7 +32,7 @@ class ArrivalStep(NamedTuple):
     lost: int = 0
     """Number of samples lost before this sample."""
     rate_hz: float | None = None
-    """Measured rate, Hz, at the time when an unexpected rate is detected; None otherwise."""
+    """Measured rate, Hz, if an unexpected rate is detected at this sample; None otherwise."""
 
 
 _CONTINUES = ArrivalStep()
@@ -56,7 +56,7 @@ class ArrivalGaps:
         self._since_ns = 0
 
     def add(self, t_ns: int) -> ArrivalStep:
-        """Add a sample that arrived at `t_ns`; return the losses and the rate that it shows."""
+        """Add a sample that arrived at `t_ns`; return the loss or rate that it reveals."""
         if self._due_ns is None:
             self._due_ns, self._since_ns = float(t_ns), t_ns
             self._least_ns = 0.0

@@ -34,7 +34,7 @@ _LEAST = 1e-12
 
 
 class LpmsCanImu:
-    """LPMS sensor on a CAN bus, which sends an orientation in one or more frames, without time."""
+    """LPMS sensor on a CAN bus. It sends each orientation in one or more frames, and no time."""
 
     Settings: ClassVar[type[LpmsCanSettings]] = LpmsCanSettings
     wire: ClassVar[Wire] = "can"

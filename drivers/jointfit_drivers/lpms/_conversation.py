@@ -87,12 +87,12 @@ class LpBusConversation(SerialConversation[LpBusMessage]):
     async def write(
         self, command: int, data: bytes = b"", *, wait_s: float = REPLY_S
     ) -> bool | None:
-        """Send a command; return whether the sensor acknowledged it, or None without any reply."""
+        """Send a command; return whether the sensor acknowledged it; None if no reply arrives."""
         reply = await self._exchange(command, _ACKNOWLEDGEMENTS, data, wait_s=wait_s)
         return None if reply is None else reply.command == LpmsCommand.ACK
 
     async def start_stream(self) -> bool | None:
-        """Start the stream; return whether the sensor accepts this, or None without any reply."""
+        """Start the stream; return whether the sensor accepts the command; None without a reply."""
         for _ in range(3):
             replies = _ACKNOWLEDGEMENTS | {LpmsCommand.DATA}
             reply = await self._exchange(LpmsCommand.STREAM_MODE, replies)

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from jointfit_protocols.lpms.measurement import LpmsMeasurement
 
 _SECONDS_CLOCK = TickClock(1_000, None)
-"""Device time of firmware that sends seconds, which are converted to microseconds."""
+"""Clock of firmware that sends device time in seconds, which are converted to microseconds."""
 _MOST_SECONDS = 1e9
 _DATA = int(LpmsCommand.DATA)
 _TEXT_BYTES = 256
@@ -111,7 +111,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
 
     @override
     def flush(self) -> list[Decoded]:
-        """Discard an incomplete message, and a packet that waits for confirmation."""
+        """Discard an incomplete message and an unconfirmed packet; return samples and events."""
         out = super().flush() + self._decode_packets(self._search.flush())
         return out + self._drop_held()
 
@@ -141,7 +141,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
         message, arrival_ns = arrived
         measurement = self._layout.decode(message.data)
         if measurement is None or "quaternion" not in self._layout.places:
-            return self._length_warning(message)  # valid, but with other outputs
+            return self._length_warning(message)  # a valid packet with other outputs
 
         out: list[Decoded] = []
         if not self._check.done:
@@ -191,7 +191,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
         return self._unwrapped
 
     def _sample(self, packet: _Packet) -> list[Decoded]:
-        """Return the sample of an accepted packet."""
+        """Return the sample and the events of an accepted packet."""
         measurement = packet.measurement
         converted = self._orientation.convert(packet.quaternion, floats=measurement.floats)
         out, self._orientation.events = self._orientation.events, []

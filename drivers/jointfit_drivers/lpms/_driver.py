@@ -42,7 +42,7 @@ class LpmsImu:
             The port is absent, in use, unplugged, or silent for ``lost_after_s``. A retry may
             succeed.
         DeviceMisconfiguredError
-            The file is not a serial port, no LPMS sensor answers, the sensor has another speed,
+            `port` is not a serial port, no LPMS sensor answers, the sensor has another speed,
             generation or address, or it does not accept the settings.
         """
         settings = self._settings

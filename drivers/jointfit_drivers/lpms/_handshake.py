@@ -139,7 +139,7 @@ class LpmsHandshake:
             await self._conversation.write(self._table.store, wait_s=_STORE_S)
 
     async def _read_configuration(self) -> LpmsConfiguration:
-        """Return the settings of the sensor. If the precision cannot be read, it is unknown."""
+        """Return the settings of the sensor. The precision is None if it cannot be read."""
         found = LpmsConfiguration()
         for command in self._table.reads:
             data = await self._conversation.read(command)
@@ -232,7 +232,10 @@ class LpmsHandshake:
         )
 
     async def _other_speed(self) -> int | None:
-        """Return the speed, bit/s, at which the sensor answers; it then continues to stream."""
+        """Return the speed, bit/s, at which the sensor answers; None if no speed is found.
+
+        A sensor that answered continues to stream.
+        """
 
         async def answers() -> bool:
             entered = await self._conversation.enter_command_mode(tries=1, wait_s=_LISTEN_S)

@@ -3,7 +3,7 @@
 A data packet does not name its outputs. If a recording lacks the replies to the driver's requests,
 or if it was made while another program used the sensor, only the length of the packets is known.
 The outputs have a fixed order, so few places are possible for the quaternion. The norm of the
-quaternion is 1 in every packet. The norm of an acceleration at rest may also be 1, but with a
+quaternion is 1 in every packet. The norm of an acceleration in g may also be 1 at rest, but with a
 larger deviation.
 
 Invariant: the result depends only on the packets fed; at most `_MOST_HELD` packets are stored.
@@ -63,7 +63,7 @@ class OutputSearch:
         """Layout of the packets. Until another layout is found, packets are assumed to contain
         only the quaternion."""
         self._candidates: dict[int, list[PacketLayout]] = {}
-        self._size: int | None = None  # of the packets that `layout` describes, bytes
+        self._size: int | None = None  # size of the packets of `layout`, bytes
         self._held: list[ArrivedPacket] = []
         self.events: list[Decoded] = []
         """Events that were not returned yet."""
@@ -146,7 +146,7 @@ class OutputSearch:
 
 
 def _masks(outputs: Sequence[LpmsOutput]) -> dict[int, int]:
-    """Return, by the total number of values, the bit mask of one subset of `outputs`."""
+    """Return the bit mask of one subset of `outputs` for each possible total number of values."""
     masks = {0: 0}
     for output in outputs:
         for count, mask in list(masks.items()):
@@ -155,7 +155,7 @@ def _masks(outputs: Sequence[LpmsOutput]) -> dict[int, int]:
 
 
 def _deviation(layout: PacketLayout, data: bytes) -> float | None:
-    """Return the deviation of the quaternion's norm from 1; None if it is too large."""
+    """Return the deviation of the quaternion's norm from 1; None if the norm is implausible."""
     measurement = layout.decode(data)
     if measurement is None:
         return None

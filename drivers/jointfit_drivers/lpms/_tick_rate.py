@@ -1,7 +1,8 @@
 """Check of the configured unit of device time against the arrival times.
 
 The number of ticks per second of each model was not verified on hardware, and old firmware sends
-seconds instead of ticks. The arrivals of several seconds show both faults.
+seconds instead of ticks. A comparison with the arrivals of several seconds reveals a wrong number
+of ticks and a wrong unit.
 
 Invariant: the result depends only on ticks and arrival stamps.
 """

@@ -1,8 +1,8 @@
 """Driver of motion capture that arrives as a stream of the Lab Streaming Layer.
 
-`LslMarkersDecoder` is the pure part. `LslMarkersMocap.run` searches for the stream. It emits
-description, samples and clock comparisons as chunks, so that a replay has the same input as the
-live decoder.
+`LslMarkersDecoder` is pure. `LslMarkersMocap.run` searches for the stream. It then emits the
+description, the samples and the clock comparisons as chunks, so that the decoder has the same input
+in a replay.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class LslMarkersMocap:
-    """One stream of markers or rigid bodies, stamped by the LSL clock of the sending PC."""
+    """One stream of markers or rigid bodies, usually stamped by the LSL clock of the sending PC."""
 
     Settings: ClassVar[type[LslMarkersSettings]] = LslMarkersSettings
     wire: ClassVar[Wire] = "datagram"

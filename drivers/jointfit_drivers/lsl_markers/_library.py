@@ -85,8 +85,8 @@ def compare_clocks(lsl: Any, inlet: Any, wait_s: float) -> RoundTrip | None:
     """Return the latest comparison of the sender's clock with CLOCK_MONOTONIC of this host.
 
     liblsl queries the sender every few seconds, and uses the reply with the shortest round-trip
-    time. The uncertainty is this round-trip time. The result is None if no reply arrives within
-    `wait_s`.
+    time. The uncertainty of the comparison is this round-trip time. The result is None if no reply
+    arrives within `wait_s`.
     """
     remote, uncertainty, code = ctypes.c_double(), ctypes.c_double(), ctypes.c_int()
     ask = lsl.lib.lib.lsl_time_correction_ex  # `StreamInlet.time_correction` has no uncertainty

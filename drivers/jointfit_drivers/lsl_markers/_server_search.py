@@ -37,7 +37,7 @@ async def find_servers(
     """Return the streams that answer; see `ServerSearch.find_servers`.
 
     The result is empty if the extra ``lsl`` is not installed. It is also empty if `port` is given:
-    LSL has no fixed port, so the search is for another device family.
+    LSL has no fixed port, so a search with a port is for another device family.
     """
     if port is not None or not (hosts or broadcast):
         return []

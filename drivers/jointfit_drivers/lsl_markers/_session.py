@@ -52,7 +52,7 @@ _BUFFER_S = 10
 _OTHERS = 32
 """Number of streams after which the search for all streams, fitting or not, ends."""
 _LISTED = 8
-"""Largest number of streams in an error."""
+"""Largest number of streams in an error message."""
 _FORMATS = dict(enumerate(("", "float32", "double64", "string", "int32", "int16", "int8", "int64")))
 """Names of the sample formats of liblsl, by number."""
 
@@ -214,6 +214,8 @@ class LslSession:
 
     def _describe(self, lsl: Any, inlet: Any) -> str:
         """Emit the description, begin to receive, and return the format of the channels.
+
+        After a cancellation, the result has no meaning.
 
         Raises
         ------

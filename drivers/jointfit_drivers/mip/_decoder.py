@@ -65,7 +65,7 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
     baud : int, optional
         Line speed, bit/s, for back-dating of stamps; None for USB.
     required : RequiredFields
-        Data set and fields that contain the orientation.
+        Data set and fields that the device must send.
     make_raw : callable, optional
         Function that returns a new filter of raw measurements; None if the device sends
         orientations.

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from jointfit_protocols.mip import MipPacket
 
 _SMALL = 1e-4
-"""Largest vector component of a quaternion that counts as no rotation. This value is equal to a
-rotation by 0.01 degrees."""
+"""Largest vector component of a quaternion that counts as no rotation. This value corresponds to a
+rotation by about 0.01 degrees."""
 _FORMATS = {
     Setup.FORMAT_REPLY: None,
     Setup.IMU_FORMAT_REPLY: 0x80,
@@ -67,7 +67,7 @@ def _events_of(command_set: int, descriptor: int, data: bytes) -> Iterator[Decod
         return
     stored = [round(value, 6) for value in turn]
     yield DeviceEvent("info", f"sensor_to_vehicle {stored}", {"sensor_to_vehicle": stored})
-    if not max(map(abs, turn[1:])) <= _SMALL:  # NaN compares false
+    if not max(map(abs, turn[1:])) <= _SMALL:  # also true for NaN
         text = (
             f"a sensor-to-vehicle transform is stored (w x y z = {stored}): the device sends in "
             "vehicle axes, not in the axes on its housing. Remove the transform with SensorConnect "

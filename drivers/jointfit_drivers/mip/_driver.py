@@ -43,8 +43,8 @@ class MipImu:
             The port is absent, in use, unplugged, or silent for ``lost_after_s``. A retry may
             succeed.
         DeviceMisconfiguredError
-            The file is not a serial port, no MIP device answers, or the device uses another speed
-            or cannot send the orientation at this rate.
+            `port` is not a serial port, no MIP device answers, or the device uses another speed or
+            cannot send the orientation at this rate.
         """
         settings = self._settings
         await self._reception.run(

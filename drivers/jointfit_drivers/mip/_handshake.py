@@ -5,7 +5,7 @@ Written settings are volatile: without ``persist``, the device returns to its st
 next power-up.
 
 A fault that may end without a change of the settings raises `DeviceLostError`. All other faults
-raise `DeviceMisconfiguredError`. If such a fault occurs during the configuration, the driver
+raise `DeviceMisconfiguredError`. If this error is raised during the configuration, the driver
 requests the device to resume its stream. Settings that were already written keep their new values
 until the next power-up.
 """

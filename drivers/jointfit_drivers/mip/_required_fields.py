@@ -40,7 +40,10 @@ class RequiredFields(NamedTuple):
 
     @property
     def packet_bytes(self) -> int:
-        """Bytes of a packet with the required fields from a legacy device; others send less."""
+        """Size of a packet with the required fields of a legacy device, bytes.
+
+        The packets of current devices are smaller.
+        """
         fields = self.with_time("legacy")
         return _FRAME_BYTES + sum(field_bytes(self.data_set, field) for field in fields)
 

@@ -213,7 +213,7 @@ def _columns(what: str, entries: Sequence[ModelEntry], wanted: Mapping[str, str]
 def _unused_name(
     entry: ModelEntry, plain: Mapping[str, list[ModelEntry]], used: set[str]
 ) -> str | None:
-    """Return the plain name if it is unique, or a name with its owner; None if all are used."""
+    """Return the first unused name: plain if unique, or with its owner; None if there is none."""
     full = f"{entry.owner}/{entry.name}" if entry.owner else entry.name
     choices = [entry.name] if len(plain[entry.name]) == 1 else []
     choices += [full, f"{full}#{entry.member}", f"{full}#{entry.key}"]

@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 _REORDERED = 100
-"""Largest decrease of the number of a reordered datagram. A larger decrease is a restart of the
-server or of a recording that is played in a loop."""
+"""Smallest decrease of the frame number that shows a restart of the server, or of a recording that
+is played in a loop. A smaller decrease is a reordered datagram."""
 _FASTEST_HZ = 2000
 """Upper limit of the frame rate of camera systems, Hz. If the number increases faster, the
 server restarted."""

@@ -98,7 +98,7 @@ class Reception:
         return found
 
     async def receive(self, limit_s: float) -> None:
-        """Receive until `FRAMES_S` after the first frame, but for at most `limit_s`."""
+        """Wait for the first frame, at most `limit_s` seconds, and then receive for `FRAMES_S`."""
         arrived = asyncio.Event()
 
         def take(chunk: Chunk) -> None:

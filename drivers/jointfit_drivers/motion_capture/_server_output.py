@@ -12,14 +12,15 @@ if TYPE_CHECKING:
 class ServerOutput:
     """Emits the chunks of a server, across all connections of a driver.
 
-    If frames have stopped, or a connection has answers but no frame, answers are not emitted before
-    the next frame. Otherwise a server that sends only answers would be reported as lost again at
-    every connection.
+    If the frames have stopped, or if the previous connection received answers but no frame, answers
+    are emitted only with the next frame. Otherwise a server that sends only answers would be
+    reported as lost again at every connection.
     """
 
     def __init__(self) -> None:
         self.silent = False
-        """Whether frames have stopped and none has arrived since then, in any connection."""
+        """Whether frames have stopped, or the previous connection received answers but no frame.
+        The next frame ends this state."""
         self._answered = self._framed = False
         self._held: list[Chunk] = []
 

@@ -30,7 +30,7 @@ class UnitCheck:
         self._reports = 0
 
     def feed(self, x: float, y: float, z: float) -> str | None:
-        """Add a position as sent by the server; return a warning, or None without new warning."""
+        """Add a position as sent by the server; return a new warning, or None."""
         if self._reports > _REPORTS:
             return None
         largest = max(abs(x), abs(y), abs(z))

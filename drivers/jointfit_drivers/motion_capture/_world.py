@@ -1,8 +1,8 @@
 """Conversion of positions and orientations to a world with z up; missing data become NaN.
 
-The **world** is rotated: p' = R p and q' = q_R q. The axes of a body remain as the vendor defines
-them. Positions that are not finite or not plausible count as missing. Orientations that are not
-rotations also count as missing.
+The **world** is rotated: p' = R p and q' = q_R q, where q_R is the quaternion of the rotation
+matrix R. The axes of a body remain as the vendor defines them. Positions that are not finite or not
+plausible count as missing. Orientations that are not rotations also count as missing.
 """
 
 from __future__ import annotations

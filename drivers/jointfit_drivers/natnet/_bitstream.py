@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 UNKNOWN: Version = (0, 0)
 _MOST_LAYOUTS = 64
-"""Largest number of stored layouts of frames, one per length."""
+"""Largest number of stored layouts of frames, one per version and length."""
 FRAME_START = int(NatNetMessageId.FRAMEOFDATA).to_bytes(2, "little")
 """First bytes of a datagram that contains a frame, in every bitstream version."""
 
@@ -57,7 +57,10 @@ class BitstreamTracker:
         return self.version != UNKNOWN
 
     def announce(self, version: Version) -> None:
-        """Add the version in a SERVERINFO. The first version is used; later ones are candidates."""
+        """Add the version in a SERVERINFO as a candidate.
+
+        The version is used at once if the version in use is unknown or not supported.
+        """
         self._announced = version
         if not self.known or not is_supported(self.version):
             self.version = version
@@ -67,7 +70,7 @@ class BitstreamTracker:
         self._confirmed = version
 
     def select_sets(self, names: frozenset[str]) -> None:
-        """Skip unlabeled markers and all marker sets except `names`, if this saves time."""
+        """Skip unlabeled markers and all marker sets except `names` in frames of a known layout."""
         if names != self._selected:
             self._selected = names
             self._layouts.clear()

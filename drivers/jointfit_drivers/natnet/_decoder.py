@@ -145,7 +145,7 @@ class NatNetDecoder:
             case natnet.ModelDefinition():
                 self._described["model"] = chunk.data
                 self._model(message, out)
-            # The capture contains an echo request of a client. Its arrival is the sending time.
+            # In a capture, the arrival of a client's echo request is its sending time.
             case natnet.EchoRequest(stamp):
                 if len(self._asked) >= _PENDING_ECHOES:
                     del self._asked[next(iter(self._asked))]
@@ -212,7 +212,7 @@ class NatNetDecoder:
     # --- time ---------------------------------------------------------------------------------
 
     def _echo(self, chunk: Chunk, echo: natnet.EchoResponse, out: list[Decoded]) -> None:
-        """Append a plausible echo, unless PTP synchronizes the clock."""
+        """Append a plausible echo, unless the PTP time stamps of the frames are used."""
         sent_ns = self._asked.pop(echo.stamp, echo.stamp)
         if self._time.precise or not 0 <= chunk.t_ns - sent_ns <= _ECHO_LIMIT_NS:
             return
@@ -269,7 +269,7 @@ class NatNetDecoder:
         )
 
     def _exposure_ticks(self, frame: natnet.FrameOfData, out: list[Decoded]) -> int | None:
-        """Return the instant of exposure in ticks of the clock in use.
+        """Return the instant of exposure in ticks of the clock in use; None if it is unknown.
 
         If the cameras do not stamp the exposure, it is computed from the configured latency.
         """

@@ -1,8 +1,8 @@
 """Driver of OptiTrack Motive and other servers of NatNet 2.5 to 4.x, over UDP.
 
 `NatNetDecoder` is pure: it uses no clock and no I/O. `NatNetMocap.run` connects and emits every
-accepted datagram of the server. This includes the answers of the handshake, so a replay has the
-same input as the live decoder.
+accepted datagram of the server. This includes the answers of the handshake, so the decoder has the
+same input in a replay.
 """
 
 from __future__ import annotations

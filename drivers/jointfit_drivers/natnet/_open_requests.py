@@ -87,7 +87,7 @@ class OpenRequests:
             asked_ns = self._asked_ns.pop(_REQUEST_OF_ANSWER[NatNetMessageId(kind)], None)
             accepted = asked_ns is not None and now_ns - asked_ns <= ANSWER_NS
         else:
-            accepted = True  # without effect, but the decoder counts corrupt bytes
+            accepted = True  # the message has no effect, but the decoder counts corrupt bytes
 
         self.unsolicited += not accepted
         return accepted

@@ -55,8 +55,9 @@ class PoseConverter:
     Parameters
     ----------
     up_axis : {"x", "y", "z"}
-        Axis of the stream that points up. The **world** is rotated: p' = R p and q' = q_R q. The
-        axes of a body remain as the vendor defines them.
+        Axis of the stream that points up. The **world** is rotated: p' = R p and q' = q_R q, where
+        q_R is the quaternion of the rotation matrix R. The axes of a body remain as the vendor
+        defines them.
     """
 
     def __init__(self, up_axis: str) -> None:

@@ -1,6 +1,7 @@
 """One connection to a NatNet server, from CONNECT to silence.
 
-1. The session sends CONNECT every 0.5 s until SERVERINFO arrives, which determines the data socket.
+1. The session sends CONNECT every 0.5 s until SERVERINFO arrives. SERVERINFO determines the data
+   socket.
 2. It sends REQUEST_MODELDEF every 0.5 s until MODELDEF arrives, because frames cannot be used
    without the model.
 3. It receives frames. It sends ten echo requests at intervals of 50 ms, then one every 0.8 to
@@ -8,8 +9,8 @@
    are not synchronized.
 
 Every accepted datagram is emitted in the order of arrival, so that a replay has the same input. The
-receiver of the chunks decodes the frames. This module reads only their flags. Once per second it
-also decodes one frame, to check that frames can be decoded and that their ids are known.
+receiver of the chunks decodes the frames. This module reads the flags of every frame. Once per
+second it also decodes a frame, to check that frames can be decoded and that their ids are known.
 
 Invariant: control messages are accepted only as answers to open requests (`OpenRequests`). If the
 frames of a server cannot be decoded, the server counts as lost, as if it sent nothing.
@@ -67,8 +68,8 @@ again."""
 
 _PARAMS = struct.Struct("<h")
 _PARAMS_FROM_END = 6
-"""Distance of the flags from the end, bytes. Flags and end tag end every frame from bitstream 2.6
-on."""
+"""Distance of the flags from the end of a frame, bytes. From bitstream 2.6 on, the flags and an end
+tag are the last parts of a frame."""
 _SHORTEST_FRAME = 4 + 50
 
 
@@ -260,7 +261,7 @@ class NatNetSession:
             await self._link.pause(min(due + [alive_at] * unicast) - now)
 
     def _check_alive(self, info: natnet.ServerInfo, unicast: bool, last_ns: int) -> None:
-        """Raise DeviceLostError if no frame can be decoded, or if another server answers."""
+        """Raise DeviceLostError if no decodable frame arrives, or if another server answers."""
         if self._info is not None and not same_instance(self._info, info):
             raise DeviceLostError(
                 f"{self._name}: the server restarted, or another server took its address "

@@ -36,8 +36,8 @@ _SERVER_S = 1.5
 _GREETING, _OPENED = "< hi >", "< ok >"
 """Texts that a socketcand server sends: its greeting, and its answer after it opened a bus."""
 _LONGEST = 40
-"""Largest number of bytes of an answer that are read. If another type of server answers, this is
-enough to recognize the type in the error message."""
+"""Largest number of bytes of an answer that are read. The error message contains these bytes, so
+that a user can recognize another type of server."""
 
 _opening: set[str] = set()
 """Keys of the buses that a thread is currently opening."""
@@ -46,7 +46,7 @@ _opening: set[str] = set()
 async def open_in_thread(key: str, name: str, make: Callable[[], _Bus]) -> _Bus:
     """Return the bus that `make` opens within `OPEN_S`.
 
-    If the bus is opened after the limit or after a cancellation, the thread closes it again.
+    If `make` opens the bus after the limit or after a cancellation, its thread closes the bus.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def require_socketcand(channel: str, host: str, port: int) -> None:
 
 
 def _receive_answer(connection: socket.socket) -> str:
-    """Return the next text up to ``>``; an incomplete text after 40 bytes or a disconnect."""
+    """Return the next text up to ``>``, or the text received until a disconnect or 40 bytes."""
     text = b""
     while len(text) < _LONGEST and not text.endswith(b">"):
         received = connection.recv(_LONGEST)

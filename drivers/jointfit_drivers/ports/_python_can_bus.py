@@ -43,13 +43,13 @@ log = logging.getLogger(__name__)
 # python-can logs each failed opening, which happens once a second for an absent interface. This
 # module raises the error instead.
 logging.getLogger("can.interfaces.socketcan").setLevel(logging.CRITICAL)
-# The same applies to a bus whose opening failed halfway: `_opening_error` reports the cause.
+# python-can also logs a bus whose opening failed halfway. `_opening_error` reports the cause.
 logging.getLogger("can.bus").setLevel(logging.ERROR)
 # The socketcand client logs every byte that it cannot use, and every attempt to connect.
 logging.getLogger("can.interfaces.socketcand").setLevel(logging.CRITICAL)
 
 _BATCH = 64
-"""Largest number of frames per wake-up, so that a flood on one bus does not delay others."""
+"""Largest number of frames per wake-up, so that a flood on one bus does not delay other buses."""
 _WAITING = 64
 """Largest number of batches by which a reading thread may be ahead of the event loop."""
 _PUMP_S = 0.05
@@ -120,7 +120,7 @@ class PythonCanBus:
             try:
                 self._drain(bus, deliver)
             except Exception as error:  # noqa: BLE001 - a loop callback's error would only be logged
-                loop.remove_reader(fd)  # report once; the next read would block
+                loop.remove_reader(fd)  # one report is enough; a further read would block
                 failed(self._receive_error(error))
 
         loop.add_reader(fd, readable)
@@ -193,7 +193,7 @@ class PythonCanBus:
                 if not message.is_fd:  # no supported device sends CAN FD
                     frames.append(self._convert_frame(message))
         finally:
-            now = time.monotonic_ns()  # not before the reads: see `_convert_frame`
+            now = time.monotonic_ns()  # must follow the reads: see `_convert_frame`
             if self._kernel and now - self._drops_read_ns > _DROPS_EVERY_NS:
                 self._drops_read_ns = now
                 raw = _socket(bus).getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)

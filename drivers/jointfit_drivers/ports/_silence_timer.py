@@ -1,8 +1,8 @@
 """A timer that detects the silence of one device.
 
-Invariant: an arrival costs only one reading of the clock. It restarts the event loop's timer only
-if `first_s` is longer than `silence_s`. When the event loop's timer ends, it is restarted for the
-rest of the permitted silence.
+Invariant: an arrival costs only one reading of the clock. Only the first arrival may restart the
+event loop's timer, if `first_s` is longer than `silence_s`. If the event loop's timer ends before
+the permitted silence is over, it is restarted for the remaining time.
 """
 
 from __future__ import annotations

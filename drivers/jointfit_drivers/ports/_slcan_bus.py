@@ -125,7 +125,7 @@ class SlcanBus:
             failed(error)
 
     async def _handshake(self) -> None:
-        """Open the adapter's bus, whatever state an earlier session left it in."""
+        """Open the adapter's bus, also if an earlier session left the bus open."""
         settings = self._settings
         await self._port.write(b"\r\r\rC\r")  # end an incomplete command, then close the bus
         for _ in range(_OLD_READS):

@@ -140,7 +140,7 @@ class SharedBus:
                 self._backend = backend
 
     async def leave(self) -> None:
-        """Unregister a user of the bus. The last user closes the bus."""
+        """Unregister a user. The last user closes the bus, or the first user if the bus failed."""
         self.users -= 1
         async with self._lock:
             if self.users and self._failed is None:
@@ -236,7 +236,7 @@ class SharedBus:
             self._subscribers.remove(subscriber)
             self._route()
             if ended.done() and not ended.cancelled():
-                ended.exception()  # mark as retrieved, in case a cancellation came first
+                ended.exception()  # marks the error as retrieved, in case of a cancellation
 
     def _explain_silence(
         self,
@@ -258,9 +258,9 @@ class SharedBus:
             key for key, t_ns in subscriber.arrived.items() if t_ns > since_ns and key != needed
         )
 
-        # The required identifier has arrived before, so the settings are correct. The text contains
-        # no duration. A duration would differ at every attempt, and every different text becomes a
-        # new line of the log.
+        # In this case the required identifier has arrived before, so the settings are correct. The
+        # text contains no duration. A duration would differ at every attempt, and every different
+        # text becomes a new line of the log.
         if not others and (subscriber.is_complete or (worked and not self._seen)):
             return f"{self.channel}: silent: check its power and wiring"
 
@@ -295,7 +295,7 @@ class SharedBus:
         return any(key in ids for ids in self._ids.values())
 
     def _filter(self) -> None:
-        """Make the backend drop unclaimed frames when every device has its required identifier."""
+        """Make the backend drop unclaimed frames once every required identifier has arrived."""
         if self._backend is not None and self._failed is None:
             complete = all(each.is_complete for each in self._subscribers)
             self._backend.listen(self._routes if complete else None)
@@ -358,7 +358,7 @@ class SharedBus:
 
 
 def _advise_id(needed: CanKey, arriving: CanKey, what: str) -> str:
-    """Return the change of the configuration with which the identifier `arriving` is accepted."""
+    """Return the change of settings that accepts `arriving` as the identifier of `what`."""
     number, extended = arriving
     width = ""
     if extended != needed[1]:

@@ -187,7 +187,7 @@ class SerialPort:
                 timer.cancel()
             loop.remove_reader(self._fd)
             if ended.done() and not ended.cancelled():
-                ended.exception()  # mark as retrieved, in case a cancellation came first
+                ended.exception()  # marks the error as retrieved, in case of a cancellation
 
     async def receive(self, timeout_s: float) -> Chunk | None:
         """Return the next chunk; None if no byte arrives within `timeout_s` seconds.
@@ -233,7 +233,7 @@ class SerialPort:
                 except OSError as error:
                     raise _unplugged_error(path, error.strerror) from error
                 if not data:  # end of file: the system has closed the port
-                    raise _unplugged_error(path, "hang-up")  # noqa: TRY301 - a call adds 10 % to the time
+                    raise _unplugged_error(path, "hang-up")  # noqa: TRY301 - a call costs 10 % of a read
 
                 # The stamp must follow the read. A stamp from before the read would be too early
                 # for bytes that arrive while this process is delayed, and clocks are fitted to the

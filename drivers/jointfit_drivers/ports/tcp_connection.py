@@ -1,7 +1,7 @@
 """TCP connections that return the arrival time of received data.
 
-The kernel stamps segments at their arrival, and `SocketStamps` converts the stamps. The streams of
-asyncio do not return these stamps (ancillary data), so this module reads the sockets itself.
+The kernel stamps TCP segments at their arrival, and `SocketStamps` converts the stamps. The streams
+of asyncio do not return these stamps (ancillary data), so this module reads the sockets itself.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class TcpConnection:
         host, port : str, int
             Numeric address and port of the server.
         local : str
-            Address of the network card of this host.
+            Address of the network card of this host to use.
         within_s : float
             Longest wait for the answer, s.
 
@@ -130,7 +130,7 @@ class TcpListener:
     Parameters
     ----------
     local : str
-        Address of the network card of this host.
+        Address of the network card of this host to use.
     """
 
     def __init__(self, local: str) -> None:

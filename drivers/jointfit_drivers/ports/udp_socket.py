@@ -27,7 +27,8 @@ RECEIVE_BUFFER = 1 << 20
 host is busy."""
 
 _IP_RECVERR = 11
-"""Socket option with which an ICMP refusal becomes an error of this socket, connected or not."""
+"""Socket option with which an ICMP refusal becomes an error of this socket, whether or not the
+socket is connected."""
 _IP_MULTICAST_ALL = 49
 """Socket option. The value 0 restricts reception to the groups that this socket joined."""
 _SIOCGIFADDR = 0x8915

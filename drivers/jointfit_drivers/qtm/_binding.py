@@ -34,10 +34,11 @@ class QtmBinding:
 
     columns: ColumnBinding
     marker_places: list[int]
-    """Index of each marker column in the 3D component (the part of a frame with the markers)."""
+    """For each marker column, the index of the marker in the 3D component (the part of a frame with
+    the markers)."""
     body_keys: tuple[int, ...]
-    """Index of each body column in the 6D component (the part of a frame with the bodies), or the
-    `segment_key` of the column."""
+    """For each body column, the index of the body in the 6D component (the part of a frame with the
+    bodies), or the `segment_key` of a skeleton segment."""
     labels: int
     """Number of labeled markers."""
     bodies: int
@@ -66,7 +67,7 @@ def bind_settings(
     settings : QtmSettingsXml
         Most recent settings of the server.
     markers, bodies : mapping of str to str
-        Names in rig.toml, each with its key.
+        Names in rig.toml, each with the key that contains it, for messages.
     """
     of_markers = [
         ModelEntry(place, "", name, place + 1)

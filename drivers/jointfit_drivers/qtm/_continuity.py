@@ -1,7 +1,8 @@
 """Order of the frames of one server of Qualisys Track Manager (QTM), by their time stamps.
 
-Frame numbers are not reliable. They can stay at 1 in live preview, and the real-time rate can be a
-fraction of the camera rate. Losses are counted in units of the usual step of the number.
+Frame numbers are not reliable. They can stay at 1 in live preview. They increase by more than 1 per
+frame if the real-time rate is a fraction of the camera rate, so losses are counted in units of the
+usual step.
 
 Invariant: the module is pure. A decrease of the stamp that reordering cannot explain shows a
 restart, because the time of each measurement and of each loop of a recording begins at 0.

@@ -202,7 +202,7 @@ class QtmDecoder:
             live = number == QtmEvent.RT_FROM_FILE_STOPPED
             if live != self._live:
                 self._live = live
-                text = "live again" if live else "QTM plays back a recording"
+                text = "QTM sends live data again" if live else "QTM plays back a recording"
                 out.append(DeviceEvent("setting", text, {"live": live}))
         if number in (QtmEvent.CAPTURE_STARTED, QtmEvent.CAPTURE_STOPPED,
                       QtmEvent.RT_FROM_FILE_STARTED, QtmEvent.RT_FROM_FILE_STOPPED):  # fmt: skip

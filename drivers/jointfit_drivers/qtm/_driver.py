@@ -48,7 +48,8 @@ class QtmMocap:
         ------
         DeviceLostError
             The host is unknown, does not answer, has no listening server, or has too many clients.
-            Or it sends no frame for ``silence_s`` during a measurement. A retry may succeed.
+            Or the server sends no frame for ``silence_s`` during a measurement. A retry may
+            succeed.
         DeviceMisconfiguredError
             The host is not a QTM server, its port is big-endian, its version is not supported, or
             the network card does not exist.

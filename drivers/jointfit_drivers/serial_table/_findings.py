@@ -70,7 +70,7 @@ def _explain_lines(data: bytes, wire: LineFormat) -> str:
 
 
 def _likely_separator(lines: Sequence[bytes], wire: LineFormat) -> str | None:
-    """Return the separator of most lines if no line contains the configured separator."""
+    """Return the separator of most lines; None if a line contains the configured separator."""
     if any(len(_cells(line, wire)) > 1 for line in lines):
         return None
     start = len(wire.prefix)
@@ -164,7 +164,7 @@ def _length_finding(
 
 
 def _is_valid(frame: bytes, checksum: Checksum, wire: FrameFormat) -> bool:
-    """Return whether a frame ends with a correct checksum of this type."""
+    """Return whether the checksum of a frame, before its `end` bytes, is correct."""
     stop = len(frame) - len(wire.end)
     checked = stop - checksum.width
     sent = int.from_bytes(frame[checked:stop], checksum.byte_order)

@@ -90,7 +90,7 @@ class NumberSettings(Settings):
 class LengthSettings(NumberSettings):
     """Field of the frame that contains the length of the frame."""
 
-    adds: int = Field(0, description="size of the whole frame minus this number, bytes")
+    adds: int = Field(0, description="size of the frame minus the value of this field, bytes")
     longest: int = Field(
         LONGEST_FRAME, ge=4, le=LONGEST_FRAME, description="size of the largest frame, bytes"
     )
@@ -224,7 +224,7 @@ class SerialTableSettings(SerialImuSettings, TableImuSettings):
         )
 
     def _place_part(self, name: Quantity, part: FieldSettings, count: int) -> list[TableField]:
-        """Return the positions of a field. Columns of text lines have the same form."""
+        """Return the positions of `count` components; in text lines, the offset is the column."""
         del name
         column = getattr(part, "column", None)
         if self.text is None:

@@ -48,8 +48,8 @@ class RecordStep(NamedTuple):
     held: bool = False
     """Whether this sample must wait for the next sample."""
     confirmed: bool = False
-    """Whether the held sample is valid and must be used before this one; otherwise it is
-    dropped."""
+    """Whether the held sample is valid and must be used before this sample. A held sample that is
+    not confirmed is dropped."""
     lost_since: int = 0
     """Number of samples lost between the held sample and this sample."""
 
@@ -158,7 +158,10 @@ class RecordContinuity:
         return step if self._counts is None else step % self._counts
 
     def _count_by_counter(self, c: int | None, elapsed_ns: int) -> int | None:
-        """Return the number of samples according to the counter alone."""
+        """Return the number of samples since the last one, according to the counter.
+
+        Return 1 without a counter, and None if the step `c` contradicts the arrival times.
+        """
         if c is None:
             return 1
         samples = elapsed_ns / self._period_ns

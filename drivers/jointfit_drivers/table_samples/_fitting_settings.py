@@ -2,7 +2,7 @@ r"""Search for settings of a table that fit the data, if the configured settings
 
 Quaternions have the norm 1, and specific forces have the norm of gravity most of the time. If byte
 order or type is wrong, the norms of the raw counts vary. If only the scale is wrong, the norms are
-constant, and their median is the scale.
+constant, and their median determines the scale.
 
 Invariant: the result depends only on the received numbers.
 """

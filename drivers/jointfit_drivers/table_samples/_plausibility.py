@@ -70,7 +70,7 @@ class PlausibilityChecks:
         """Return the findings after the next record, whose components in SI units are `si`."""
         out: list[DeviceEvent] = []
         if self._samples is not None:
-            # All components are known, because a record without measurements is not passed here.
+            # Measured components are known, because codecs drop a sample that lacks one of them.
             values = cast("tuple[float, ...]", record.values)
             self._samples.append((record.data, values, si))
             if len(self._samples) >= _CHECKED:

@@ -4,8 +4,10 @@ The direction a of the specific force is constant in the world. In sensor axes i
 
 .. math:: \Delta a = -k \, (\omega \times a) \, \Delta t ,
 
-with k = 1 if the rate is in rad/s. The factor k is the slope of a regression over the first
-rotations. Linear acceleration adds noise to the differences, but does not bias the slope.
+where :math:`\omega` is the angular rate, rad/s, according to the configured unit, and :math:`\Delta
+t` is the duration of a step. If this unit is correct, k is 1. The factor k is the slope of a
+regression over the first rotations. Linear acceleration adds noise to the differences, but does not
+bias the slope.
 
 Invariant: the result depends only on the readings fed. The check reads no clock.
 """

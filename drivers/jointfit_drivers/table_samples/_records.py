@@ -35,7 +35,7 @@ class SampleForm(NamedTuple):
     mask: int = -1
     """Mask of the bits in the validity number that are evaluated."""
     equals: int | None = None
-    """Value of these bits in a valid sample; None if any value except 0 is valid."""
+    """Value of the masked bits in a valid sample; None if any value except 0 is valid."""
     world: World = "ENU"
     world_to_sensor: bool = False
     fields: Mapping[int, TableField] | None = None

@@ -222,7 +222,7 @@ def sample_form(form: TableForm, settings: TableImuSettings, *, is_text: bool) -
 
 
 def orientation_faults(form: TableForm, settings: TableImuSettings, *, timed: bool) -> Faults:
-    """Return faults for quantities that the selected computation of the orientation requires.
+    """Return a fault for each missing quantity that the source of the orientation requires.
 
     Parameters
     ----------

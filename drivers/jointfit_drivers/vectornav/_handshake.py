@@ -3,8 +3,8 @@
 The driver reads registers, and writes only registers that differ. Written values are volatile:
 without ``persist``, the device returns to its stored values at the next power-up. A fault that may
 end without a change of the settings raises `DeviceLostError`. All other faults raise
-`DeviceMisconfiguredError`. Before this error, the driver requests the device to resume; registers
-that were already written keep their new values until the next power-up.
+`DeviceMisconfiguredError`. Before it raises this error, the driver requests the device to resume.
+Registers that were already written keep their new values until the next power-up.
 """
 
 from __future__ import annotations

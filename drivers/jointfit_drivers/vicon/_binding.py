@@ -44,7 +44,7 @@ def bind_subjects(
     subjects : sequence of SubjectInfo
         Most recent description of the subjects from the server.
     markers, bodies : mapping of str to str
-        Names in rig.toml, each with its key.
+        Names in rig.toml, each with the key that contains it, for messages.
     """
     of_markers = [
         ModelEntry(member_key(subject.subject, marker.id), subject.name, marker.name, number)

@@ -46,8 +46,8 @@ class ViconMocap:
         Raises
         ------
         DeviceLostError
-            The host is unknown, does not answer, or has no listening server. Or it sends no frame
-            for ``silence_s``. A retry may succeed.
+            The host is unknown, does not answer, or has no listening server. Or the server sends no
+            frame for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
             The host is not a DataStream server, offers no segments and markers, or the network card
             does not exist.

@@ -44,7 +44,7 @@ class AnnouncedLatency:
 
     @property
     def uncertainty_ns(self) -> int:
-        """Half of the round-trip time plus the standard deviation of the sums, ns."""
+        """Standard deviation of the sums, plus half of the mean round-trip time, ns."""
         spread = statistics.pstdev(self._sums_ns) if len(self._sums_ns) > 1 else 0.0
         return round(self._half_trip_ns + spread)
 

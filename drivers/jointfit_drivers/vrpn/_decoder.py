@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from jointfit_drivers.vrpn._settings import VrpnSettings
 
 _STEP_US = 100_000
-"""Smallest difference between elapsed server time and arrival time that counts as a step of the
-server's clock, µs."""
+"""Smallest difference between elapsed server time and elapsed arrival time that counts as a step of
+the server's clock, µs."""
 _PACE_US = 250_000
 """Time with messages at the server's own rate after which their delay is known, µs."""
 _LATEST_US = 1_000_000

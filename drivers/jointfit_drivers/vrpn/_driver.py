@@ -45,7 +45,7 @@ class VrpnMocap:
         ------
         DeviceLostError
             The host is unknown, does not answer, has no listening server, or closes the connection.
-            Or it sends no pose for ``silence_s``. A retry may succeed.
+            Or the server sends no pose for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
             The host is not a VRPN server, its major version differs, or the network card does not
             exist.

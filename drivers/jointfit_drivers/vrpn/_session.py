@@ -106,7 +106,7 @@ class VrpnSession:
             ) from error
 
     async def _announce(self) -> TcpConnection:
-        """Request the server by UDP to connect back."""
+        """Request the server by UDP to connect back, and return its connection."""
         host, local = self._route
         listener = TcpListener(local)
         try:

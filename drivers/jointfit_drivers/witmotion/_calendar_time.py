@@ -11,8 +11,8 @@ from __future__ import annotations
 from jointfit_protocols.witmotion import TICK_NS
 
 _SLACK_NS = 1_000_000_000
-"""Largest difference between elapsed device time and arrival time without a glitch, ns. It exceeds
-the delay of buffered bytes."""
+"""Largest difference between elapsed device time and elapsed arrival time without a glitch, ns. It
+exceeds the delay of buffered bytes."""
 _CONFIRMED = 3
 """Number of consecutive times after a step that prove that the clock was set."""
 

@@ -100,7 +100,7 @@ class WitMotionDecoder:
         self._rate: bytes | None = None
         self._refused = 0
         self._kinds: set[int] = set()
-        self._kinds_counted = 0  # frames so far; the codec is ahead by the rest of a chunk
+        self._kinds_counted = 0  # processed frames; the codec counts a whole chunk at once
         self._norm_checked = self._kinds_checked = self._other_reported = False
 
     @property
@@ -202,8 +202,8 @@ class WitMotionDecoder:
         if force is None or rate is None:
             return []  # a frame of this sample was lost
 
-        # The filter needs time between readings: the device's time, or the mean period if it is
-        # missing.
+        # The filter needs the time between readings. If the device time is missing, the mean period
+        # is used.
         t_ns = self._calendar.reading_ns(ticks, raw.period_ns)
         self._ticks = None
         reading = RawReading(t_ns, rate_of(rate), acceleration_of(force), field)

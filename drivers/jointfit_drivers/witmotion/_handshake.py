@@ -159,7 +159,7 @@ class WitMotionHandshake:
         return _Reception(counts, codec.fed, codec.other_frames, seconds, registers)
 
     async def _read_settings(self) -> tuple[int, int, int, int] | None:
-        """Return the registers content, rate, speed and the next one; None without an answer."""
+        """Return the registers content, rate, speed and the next register; None without a reply."""
         await self._port.write(read_register(WitMotionRegister.CONTENT))
         answer = await self._listen(_ANSWER_S, lambda c: WitMotionFrameKind.REGISTERS in c)
         return answer.registers
@@ -236,7 +236,7 @@ class WitMotionHandshake:
                 continue
             try:
                 self._port.set_baud(baud)
-            except DeviceMisconfiguredError:  # the port does not support it
+            except DeviceMisconfiguredError:  # the port does not support this speed
                 continue
             self._flush()
             found = await self._listen(_SEARCH_S)

@@ -1,7 +1,7 @@
 """Selection of one device on a line with several devices.
 
 Devices on one line differ in the bus id of their messages. The devices are attached to different
-segments, so only the orientations of one device may be used.
+body segments, so only the orientations of one device may be used.
 
 Invariant: the result depends only on the bus ids fed.
 """

@@ -42,9 +42,10 @@ _SLACK_SHARE = 0.02
 _LEARNED = 10
 """Number of counts after which the measured rate replaces the nominal rate."""
 _PACE_NS = 250_000_000
-"""Largest difference between elapsed device and arrival time without restart or backlog, ns."""
+"""Largest difference between elapsed device time and elapsed arrival time without a restart or a
+backlog, ns."""
 _LATEST_NS = 30_000_000_000
-"""Longest delay of the first messages after opening, ns."""
+"""Longest delay of the first messages after the port is opened, ns."""
 _DISTINCT = 50_000
 """Longest gap in which a contradiction between counter and time can be detected, counts.
 

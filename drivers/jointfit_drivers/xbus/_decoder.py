@@ -277,7 +277,7 @@ class XbusDecoder:
         return self._continue(step, orientation)
 
     def _continue(self, step: XbusStep, orientation: _Orientation) -> list[Decoded]:
-        """Return the sample of the held orientation, if confirmed, then that of `orientation`."""
+        """Return the samples of the held orientation, if it is confirmed, and of `orientation`."""
         held = self._held
         out = [] if step.confirmed else self._drop_held()
         self._held = orientation if step.held else None

@@ -34,7 +34,7 @@ LINE_SPEEDS = (921_600, 115_200, 460_800, 230_400, 2_000_000, 57_600, 38_400, 19
 _LISTEN_S = 0.15
 """Duration of the search at each speed, s. An acknowledgement takes 10 ms at 9600 baud."""
 _QUIET_S = 1.2
-"""If no byte arrives for this time, the earlier bytes were noise, s. Devices of other kinds may
+"""Time without a byte after which the earlier bytes count as noise, s. Devices of other kinds may
 send only once a second."""
 _RESETS, _RESET_WAIT_S = 50, 0.1
 """Number of requests after a reset, and the interval between them, s. An MTi-G-700 that had not
@@ -247,7 +247,7 @@ class XbusHandshake:
 
         speed = await self._other_speed() if self._hunt or received else None
         if speed is not None:
-            if await self._listen_at(self._settings.baud):  # USB ignores the speed
+            if await self._listen_at(self._settings.baud):  # on USB, the speed has no effect
                 raise DeviceLostError(
                     f"{self._path}: the device answers too late; retrying. If this repeats, check "
                     "its cable, and the load of the gateway"
@@ -277,7 +277,7 @@ class XbusHandshake:
     async def _other_speed(self) -> int | None:
         """Return the speed at which the device answers; None if it does not answer.
 
-        The device then continues to measure.
+        After the search, the device continues to measure.
         """
 
         async def answers() -> bool:

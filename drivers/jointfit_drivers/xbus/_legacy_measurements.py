@@ -51,7 +51,7 @@ class LegacyMeasurements:
 
     @property
     def world_id(self) -> int:
-        """Identifier of the MTData2 quaternion that refers to the same world."""
+        """Identifier of the MTData2 quaternion that refers to the world of the MTData messages."""
         ned = self._layout is not None and self._layout.settings & NED
         return real_id(Item.QUATERNION, world="NED" if ned else self._world)
 
@@ -94,7 +94,7 @@ class LegacyMeasurements:
 
 
 def _of_matrix(by_columns: tuple[float, ...]) -> Quaternion:
-    """Return the quaternion of a matrix by columns; only a rotation matrix yields the norm 1."""
+    """Return the quaternion of a matrix given by columns; its norm is 1 only for a rotation."""
     a, d, g, b, e, h, c, f, i = by_columns
     # Shepperd (1978): the largest component is the most accurate.
     squares = (1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i)

@@ -44,7 +44,7 @@ _SILENT = _NEAR + 1
 _RAN_ON_SHARE = 0.1
 """Largest difference between SampleTime and host time over a silence, relative to the silence."""
 _LATEST = 3000
-"""Longest delay of the first groups after opening, groups."""
+"""Longest delay of the first groups after the bus is opened, groups."""
 _LONGEST = 20_000
 """Longest accepted gap, groups. After a longer gap, the tolerance would include any pair of
 values."""
@@ -86,11 +86,11 @@ class XcdiContinuity:
     def __init__(self) -> None:
         self._track = _Track()
         self._held: _Track | None = None
-        self._rival: _Track | None = None  # the previous contradictions
+        self._rival: _Track | None = None  # the last contradictions that continue each other
         self._astray = 0
         self._contradictions: deque[bool] = deque(maxlen=_WINDOW)
         self._broken: deque[bool] = deque(maxlen=_WINDOW)
-        self._quiet = 0  # groups since a contradiction or broken group
+        self._quiet = 0  # groups since the last contradiction or broken group
         self.shared = False
 
     def group(
@@ -188,8 +188,8 @@ class _Track:
         self._host: int | None = None  # arrival of the last group with time, ticks
         self._counter: int | None = None
         self._groups = 0  # groups since the last group with time, by the counter
-        self._uncounted = 0  # groups received, or known to be lost, since the last counter
-        self._counted = False  # whether every group since then had a counter
+        self._uncounted = 0  # groups received, or known to be lost, since the last GroupCounter
+        self._counted = False  # whether every group since the last group with time had a counter
         self._steps: list[float] = []
 
     def continues(self, ticks: int | None, counter: int | None) -> bool:
@@ -221,7 +221,8 @@ class _Track:
     def groups_to(self, later: _Track) -> int | None:
         """Return the number of groups from this track to a later track that does not continue it.
 
-        Return None if time or counter jumped. Small differences between them count as corruption.
+        Return None if time or counter jumped, or if a time or the period is unknown. A small
+        difference between time and counter counts as corruption, and the result is 1.
         """
         if self._ticks is None or later._ticks is None or self.period is None:
             return None
@@ -246,7 +247,7 @@ class _Track:
             return False
 
         step = self._step_to(later._ticks, later._host)
-        if step is None:  # the delay of the first groups is unknown
+        if step is None:  # without arrival times, a delay of the first groups is assumed
             advance = (later._ticks - self._ticks) % TICKS_MODULUS
             return advance <= _LATEST * self.period
 

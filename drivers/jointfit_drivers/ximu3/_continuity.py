@@ -19,8 +19,8 @@ the limit.
 | none of the above                             | the held one is dropped, the next one is held    |
 
 Invariant: the result depends only on the values fed, and every input is accepted. During a motion
-within the range of the gyroscope, a message is delayed by at most one message, and two successive
-messages are never dropped.
+within the range of the gyroscope, a message is held until the next message at most, and two
+successive messages are never dropped.
 """
 
 from __future__ import annotations
@@ -56,9 +56,10 @@ _LONGER = 20
 _MOST_COUNTED = 50
 """Longest interval that contributes to the mean, periods."""
 _PACE_NS = 250_000_000
-"""Largest difference between elapsed device and arrival time without restart or backlog, ns."""
+"""Largest difference between elapsed device time and elapsed arrival time without a restart or a
+backlog, ns."""
 _LATEST_NS = 30_000_000_000
-"""Longest delay of the first messages after opening, ns."""
+"""Longest delay of the first messages after the port is opened, ns."""
 
 
 class XImu3Point(NamedTuple):
@@ -105,7 +106,7 @@ class XImu3Continuity:
         self._dropped = 0  # messages dropped since the last accepted one
         self._shortest = 0
         self._sum_us = self._sum_periods = 0
-        self._longer = (0, 0)  # periods of the last intervals, and their number
+        self._longer = (0, 0)  # periods in each of the last intervals, and number of intervals
         self._delay = BacklogDelay()
 
     @property

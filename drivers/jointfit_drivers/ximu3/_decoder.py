@@ -52,7 +52,7 @@ _UNUSABLE = {
     DataKind.EULER: "Euler angles are not finite",
 }
 _NEWEST = NewestKnown((1,), "the x-IMU3 GUI")
-"""Newest supported firmware: the newest that API 1.9 of the vendor's software can read."""
+"""Newest supported firmware: the newest version that API 1.9 of the vendor's software can read."""
 _OLD_PULSE_US = 10_000_000
 """Largest difference between the time of an edge and the time of the last measurement, us."""
 _LONGEST_VERSION = 32
@@ -168,7 +168,7 @@ class XImu3Decoder(SerialMessageDecoder[XImu3Data | XImu3Reply]):
         return self._continue(step, _Measurement(message, arrived_ns, native, q))
 
     def _continue(self, step: XImu3Step, measured: _Measurement) -> list[Decoded]:
-        """Return the samples of the held measurement, if confirmed, then those of `measured`."""
+        """Return the samples of the held measurement, if it is confirmed, and of `measured`."""
         held = self._held
         out = [] if step.confirmed else self._drop_held()
         self._held = measured if step.held else None

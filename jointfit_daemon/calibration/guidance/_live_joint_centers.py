@@ -203,7 +203,11 @@ class LiveJointCenters:
     def _observed_estimate(
         self, k: int, fit: CenterEstimate
     ) -> tuple[LiveJointCenter, CenterEstimate | None]:
-        """Return an estimate in which directions with hardly any rotation count as unobserved."""
+        """Return an estimate in which directions with hardly any rotation count as unobserved.
+
+        The second result is the fit in the observed directions, or None if there are fewer than
+        two.
+        """
         joint, frames = self.joints[k], int(self._frames[k])
         center = np.asarray(fit.center, dtype=np.float64)
         shown, axes, clear = np.zeros((3, 3)), np.eye(3), np.zeros(3, dtype=np.bool_)

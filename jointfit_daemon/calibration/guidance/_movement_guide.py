@@ -232,7 +232,10 @@ def _fault(name: str, part: ClusterVisibility) -> str | None:
 
 
 def _missing_movement(one: LiveJointCenter, words: JointInstructions, target: float) -> str | None:
-    """Return the movement that a joint center still needs; None if it is complete."""
+    """Return the movement that a joint center still needs, or why the center is refused.
+
+    The result is None if the center is accepted and its random error is at most `target`, m.
+    """
     if one.frames == 0:
         return "no visible markers yet: turn both sides of the joint toward the cameras"
     if one.center is None or one.unseen > 1:
@@ -267,7 +270,7 @@ def _figures(
 
 
 def _too_little(joint: str, arc: float, bends: int) -> str | None:
-    """Return the flexion that the regression of the sensors still needs, or None."""
+    """Return the flexion that the soft-tissue models still need; None if none is missing."""
     words = instructions_for(joint)
     if arc < words.arc:
         return f"{degrees(arc):.0f}° of {degrees(words.arc):.0f}° so far: {words.bend}"

@@ -74,8 +74,8 @@ class MovementProgress:
 
     chain: Chain
     standing: Mapping[str, Quaternion] = field(default_factory=dict)
-    """Orientation of each sensor in the static pose, which defines zero flexion. For sensors that
-    are missing here, the first orientation defines zero flexion.
+    """Orientation of each sensor in the static pose, which defines zero flexion. If a sensor of a
+    pair is missing here, the first orientations of both sensors define zero flexion.
     """
     _seen: dict[tuple[str, str, str], _RotationRange] = field(default_factory=dict)
     """Range for each joint and pair of sensors. Each pair has its own range, because its zero

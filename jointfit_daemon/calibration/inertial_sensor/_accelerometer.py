@@ -78,7 +78,10 @@ _SATURATED = 0.5 * STANDARD_GRAVITY
 
 @dataclass(frozen=True, slots=True)
 class AccelerometerEstimate:
-    """Parameters of an accelerometer; `matrix` (f - `bias`) is the corrected specific force."""
+    """Parameters of an accelerometer.
+
+    If f is a measured specific force, `matrix` (f - `bias`) is the corrected specific force.
+    """
 
     bias: Array
     """Bias, m/s^2, shape (3,)."""
@@ -130,7 +133,7 @@ def fit_accelerometer(forces: Array) -> AccelerometerEstimate:
     unit = forces / STANDARD_GRAVITY
     fit = fit_unit_ellipsoid(unit, DIAGONAL)
     if len(forces) >= FEWEST_SKEWED:
-        with suppress(SensorCalibrationError):  # no tilted poses
+        with suppress(SensorCalibrationError):  # raised without tilted poses
             skewed = fit_unit_ellipsoid(unit, SYMMETRIC)
             if np.sqrt(np.diag(skewed.covariance)[6:]).max() < LARGEST_SKEW_SD:
                 fit = skewed

@@ -59,7 +59,11 @@ _EQUAL_READINGS = 3
 
 @dataclass(frozen=True, slots=True)
 class GyroscopeScaleEstimate:
-    """Parameters of a gyroscope; `matrix` (rate - bias) is the corrected rate."""
+    """Parameters of a gyroscope.
+
+    `matrix` times the difference of measured rate and bias is the corrected rate. The bias is the
+    rate at rest.
+    """
 
     matrix: Array
     """Inverse scale factors, and gyroscope axes relative to the accelerometer axes, shape (3,

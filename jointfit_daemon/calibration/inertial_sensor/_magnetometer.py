@@ -62,8 +62,9 @@ _EVERY = 20
 _MOST_NAMES = 6
 """Largest number of directions in an error message."""
 _SPACING = 0.05
-"""Smallest difference of successive stored readings, as a fraction of half their mean range over
-the axes. Readings at rest contain no additional information.
+"""Smallest distance of a stored reading from the reading stored before, as a fraction of half the
+range of all readings (mean over the three axes). Readings at rest contain no additional
+information.
 """
 _SATURATED_SHARE = 0.03
 """Fraction of readings with exactly the largest or smallest value that indicates saturation."""
@@ -71,7 +72,10 @@ _SATURATED_SHARE = 0.03
 
 @dataclass(frozen=True, slots=True)
 class MagnetometerEstimate:
-    """Parameters of a magnetometer; `matrix` (m - `bias`) is the corrected field."""
+    """Parameters of a magnetometer.
+
+    If m is a measured field, `matrix` (m - `bias`) is the corrected field.
+    """
 
     bias: Array
     """Hard-iron offset in the unit of the device, shape (3,)."""

@@ -5,7 +5,7 @@ therefore be used with any model, including a model in another program. Every un
 has a separate step length::
 
     while any step is at or above the threshold:
-        for every coordinate x, y, z of every marker whose step is at or above the threshold:
+        for every marker coordinate (x, y or z) with a step at or above the threshold:
             move the coordinate by +step while the error decreases
             if it was not moved: move the coordinate by -step while the error decreases
             if it was not moved: halve the step

@@ -86,11 +86,19 @@ def refine_markers(
     validation
         Trials that are evaluated but not fitted.
     progress
-        Function that is called after every step with the completed share, 0 to 1, and the RMS
-        error, m. The method ``search`` calls it after every pass over the coordinates.
+        Function that is called after every step with the completed share, 0 to 1, and the training
+        error, m. The error is an RMS error for ``search``, and √(2F/Σw) with the cost F and the
+        weights w for the other methods. ``search`` calls the function after every pass over the
+        coordinates.
     stop
         Function that is called after every step, and by ``search`` before every coordinate. If it
         returns true, the refinement stops and returns the result of the completed steps.
+
+    Returns
+    -------
+    Refinement
+        Result. If frames are held out, ``joint`` and ``block`` select the step with the smallest
+        hold-out error.
 
     Raises
     ------

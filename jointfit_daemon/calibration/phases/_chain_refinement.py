@@ -159,8 +159,9 @@ def _select(
 ) -> tuple[TrialOutcome, dict[str, PartQuality]]:
     """Return the errors of the held-out trial, and the errors of each segment with moved markers.
 
-    The refined positions are used only on the selected segments. The errors of a segment depend on
-    its neighbors, so each selection of segments is evaluated as a whole.
+    The refined positions are used only on the selected segments. A segment is selected if it is not
+    in `refused` and the refined positions reduce the error of its markers. The errors of a segment
+    depend on its neighbors, so each selection of segments is evaluated as a whole.
     """
     model = wanted.model
     shift = found.model.positions - model.positions

@@ -84,7 +84,7 @@ def _faults(c: Calibration) -> Iterator[str]:
 
 
 def _branches(c: Calibration) -> Iterator[str]:
-    """Check that every joint of a branched limb follows the segment that carries it."""
+    """Yield the faults in `parents` and `left_joints`, which describe the branches of a limb."""
     if not c.parents and not c.left_joints:
         return
     if not len(c.parents) == len(c.left_joints) == len(c.joints) > len(c.segments):

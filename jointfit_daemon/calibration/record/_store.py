@@ -146,7 +146,8 @@ class CalibrationStore:
             except OSError as error:
                 if error.errno not in _NO_LINKS:
                     raise
-                aside.rename(self.path(version))  # FAT has no links; atomic with one writer
+                # FAT, for example, has no hard links. Renaming is safe if no other process writes.
+                aside.rename(self.path(version))
                 return version
             else:
                 return version

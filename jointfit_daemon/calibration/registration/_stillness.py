@@ -37,7 +37,8 @@ class StillnessMonitor:
     """
 
     def __init__(self) -> None:
-        self._steps: deque[tuple[int, Quaternion]] = deque()  # at most window / step + 2
+        self._steps: deque[tuple[int, Quaternion]] = deque()
+        """End and mean orientation of the last steps, at most `WINDOW_NS` / `STEP_NS` + 2."""
         self._began_ns = self._last_ns = 0
         self._sum: Quaternion | None = None
         self._calm = False

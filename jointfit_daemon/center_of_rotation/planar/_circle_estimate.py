@@ -52,7 +52,7 @@ class CircleLimits:
     rms_error: float = inf
     """Largest accepted predicted RMS error, m. If noise increases the curvature of the arc by
     chance, the center is biased and the predicted error is too small. A limit near the expected
-    error therefore selects biased centers, which are often outside their error ellipses.
+    error therefore selects biased centers, whose error ellipses often miss the true center.
     """
 
 
@@ -226,5 +226,5 @@ def arc_about(points: Array, center: Array) -> float:
     turn = np.sort(np.arctan2(seen[:, 1], seen[:, 0]))
     gaps = np.diff(turn, append=turn[0] + 2.0 * pi)
     widest = float(gaps.max())
-    # on a full circle, no gap is wider than the distance between frames
+    # on a full circle, no gap between neighboring points exceeds twice the mean gap
     return 2.0 * pi - widest if widest > 4.0 * pi / len(seen) else 2.0 * pi

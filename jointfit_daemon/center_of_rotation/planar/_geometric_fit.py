@@ -50,10 +50,11 @@ def geometric_estimate(
     .. math:: \min_c \sum_{tk} \rho\left( |x_{tk} - c| - R_k \right)
 
     where x_tk is the position of marker k in frame t, R_k the mean distance of marker k from the
-    center c, and ρ the Huber loss. k markers at different angles about the joint reduce the error
-    by much more than the factor √k, because the direction with the largest error differs from
-    marker to marker. The correlation r of the residuals of successive frames increases the
-    covariance by the factor (1 + r)/(1 - r), as in the other circle fits.
+    center c, and ρ the Huber loss. If K markers are at different angles about the joint, the error
+    is smaller than the error of one marker by much more than the factor √K, because the direction
+    with the largest error differs from marker to marker. The correlation r of the residuals of
+    successive frames increases the covariance by the factor (1 + r)/(1 - r), as in the other circle
+    fits.
 
     Parameters
     ----------

@@ -43,8 +43,9 @@ class CircleMoments(NamedTuple, Generic[Number]):
     effective: Number
     """Equivalent number of points of equal weight, (Σw)²/Σw²."""
     x: Number
-    """Centroid, m."""
+    """Coordinate x of the centroid, m."""
     y: Number
+    """Coordinate y of the centroid, m."""
     xx: Number
     """Weighted mean of x·x, m². The names of the fields below state their products in the same way.
     """

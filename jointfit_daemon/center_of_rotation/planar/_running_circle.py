@@ -315,7 +315,11 @@ def _add_pair(sums: Sums, mu: float, now: Kept, before: Kept) -> Sums:
 
 
 def _move_origin(sums: Sums, dx: float, dy: float) -> Sums:
-    """Return the sums about an origin moved by (dx, dy): products of (z, x, y, 1) are bilinear."""
+    """Return the sums about an origin that is moved by (dx, dy).
+
+    Every sum is a sum of products of two elements of (z, x, y, 1). The move multiplies the vector
+    (z, x, y, 1) by a matrix T, and the matrix M of the sums becomes T M Tᵀ.
+    """
     zz, zx, zy, z, xx, xy, yy, x, y, w = sums
     M = np.array([[zz, zx, zy, z], [zx, xx, xy, x], [zy, xy, yy, y], [z, x, y, w]])
     T = np.eye(4)

@@ -185,7 +185,8 @@ def _observed_basis(v: Array, w: Array, m: Array, scale: float, options: SphereO
     along = np.einsum("tj,tja,tjb->ab", w / u2, d, d) / total
     across = np.maximum(1.0 - np.einsum("ai,ab,bi->i", axes, along, axes), 0.0)
     noise = scale**2 * float((w / u2).sum() / total)
-    if options.keep_one:  # for soft-tissue artefact, the threshold is a fixed multiple of the noise
+    if options.keep_one:
+        # This option is for skin markers. Its threshold is a fixed multiple of the noise.
         keep = spread >= max(options.min_direction**2, NOISE_FACTOR * noise) * across
         keep[-1] = True
         return np.asarray(axes[:, keep])

@@ -44,8 +44,8 @@ CLIPS_M = (None, 0.05, 0.15, 0.3, 0.5)
 limit.
 """
 PRINTED = {"α–σ": (0.99, 0.78), "r–σ": (0.99, 0.98), "r–α": (0.99, 0.94)}
-"""Correlations in table 1 of the source. The first is between the analytic solution and the
-prediction, the second between the analytic solution and the grid search.
+"""Correlations in table 1 of the source. The first number of a pair is the correlation of the
+analytic solution with the prediction, the second its correlation with the grid search.
 """
 
 

@@ -5,14 +5,14 @@ The file type is determined from the first bytes, not from the name:
 | file | wire | chunks |
 |---|---|---|
 | pcapng, pcap | datagram | one per UDP datagram, both directions, with the time of the packet |
-| pcapng, pcap | datagram, split | the same, and the packets in one direction of a TCP connection |
-| pcapng, pcap | stream | the segments of one direction of a TCP connection |
+| pcapng, pcap | datagram, split | also one per packet in one direction of a TCP connection |
+| pcapng, pcap | stream | one per segment in one direction of a TCP connection |
 | pcapng, pcap | can | one per classic CAN frame of a SocketCAN link |
 | ``candump`` text | can | one per line, a record of `jointfit_protocols.can` |
-| raw bytes | stream | 4096 bytes each; the times are computed for 921 600 baud |
-| raw bytes | datagram, split | packets |
-| raw bytes | datagram | messages ``u16 id, u16 length, …`` that fill the file, else one datagram |
-| raw bytes | can | consecutive records of `jointfit_protocols.can` |
+| raw bytes | stream | one per 4096 bytes; the times are computed for 921 600 baud |
+| raw bytes | datagram, split | one per packet |
+| raw bytes | datagram | one per message ``u16 id, u16 length, …`` if these fill the file; or one |
+| raw bytes | can | one per 170 records of `jointfit_protocols.can` |
 
 *Split* marks a driver with a `packet_stream`, whose chunks are packets of a TCP connection.
 """
@@ -187,7 +187,7 @@ def _require_wire(path: Path, found: str, recorded: Wire, expected: Wire) -> Non
 
 
 def _walk(data: bytes) -> Iterator[Chunk]:
-    """Yield messages ``u16 id, u16 length, …`` if they fill the file exactly; else all bytes."""
+    """Yield a chunk per message ``u16 id, u16 length, …`` if these fill the file, or one chunk."""
     cuts = [0]
     while cuts[-1] + 4 <= len(data):
         (size,) = struct.unpack_from("<H", data, cuts[-1] + 2)

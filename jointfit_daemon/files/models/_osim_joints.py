@@ -1,7 +1,9 @@
 r"""Approximation of an OpenSim joint by a joint of the chain model.
 
-A rotation by one coordinate becomes a hinge if its axis is fixed. Otherwise it becomes a coupled
-joint with samples of the motion. A rotation by two or three coordinates becomes a ball joint.
+A rotation by one coordinate becomes a hinge if its axis and center are fixed. Otherwise it becomes
+a coupled joint with samples of the motion. A rotation by two or three coordinates becomes a ball
+joint. A joint with three translations becomes free, and so does a joint with translations relative
+to the ground. Other translations are omitted.
 
 A_i and t_i are the rotation and translation of sample i, φ_i is its angle, and A_rest is the
 rotation at angle zero. The axis a and the centers (c in the child, C in the parent) minimize the
@@ -167,7 +169,7 @@ def _ball(
 def _about_one(
     joint: OsimJoint, motion: JointMotion, coordinate: Coordinate, welded: NearestJoint
 ) -> NearestJoint:
-    """Return the hinge of one coordinate; a coupled joint if the axis is not fixed."""
+    """Return the hinge of one coordinate; a coupled joint if axis or center is not fixed."""
     span = _span(coordinate)
     zero = min(max(0.0, span[0]), span[1])
     values = np.concatenate(([zero, *span], np.linspace(*span, _SAMPLES)))

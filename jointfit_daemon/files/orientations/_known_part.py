@@ -42,7 +42,7 @@ class WrittenTable:
 
 
 def write_known_values(path: Path, table: TimeTable) -> WrittenTable:
-    """Write the known part of a table (see `complete_part`); no file if no frame is complete."""
+    """Write the known part of a table (see `complete_part`), if it contains a frame."""
     rows, columns = complete_part(np.isfinite(table.values))
     if rows.any():
         names = tuple(np.array(table.columns)[columns].tolist())

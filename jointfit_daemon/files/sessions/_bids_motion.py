@@ -260,8 +260,10 @@ def read_bids_session(root: Path) -> SessionData:
     Raises
     ------
     MalformedFileError
-        The folder is no data set with motion, contains several subjects or tasks, or files are
-        missing or wrong.
+        The folder is no data set with motion, contains several subjects or tasks, or a file is
+        wrong.
+    FileNotFoundError
+        The description of the channels of a tracking system is missing.
     """
     files = sorted(root.glob("sub-*/**/motion/*_motion.tsv"))
     recordings = {path.name.split("_tracksys-")[0] for path in files}

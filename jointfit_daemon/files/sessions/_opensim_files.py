@@ -160,7 +160,7 @@ def read_mot_session(path: Path) -> SessionData:
     """Return the joints of a MOT or STO file with one number in each cell.
 
     In files of other programs, every column becomes a joint with one angle, called ``angle``. The
-    exception is position columns, in m with y up: ``NAME_tx``, ``NAME_ty`` and ``NAME_tz``, or
+    exceptions are position columns, in m with y up: ``NAME_tx``, ``NAME_ty`` and ``NAME_tz``, or
     ``NAME_x``, ``NAME_y`` and ``NAME_z``. Three such columns become the positions of a joint.
     """
     table = read_sto(path)

@@ -137,7 +137,10 @@ class MagneticDisturbanceDetector:
         return (name, deviation) if name in self.corrections and agrees else None
 
     def _follow(self, t_ns: int, targets: Mapping[str, float], ambiguity: float) -> bool:
-        """Move the corrections towards their targets without a jump."""
+        """Move the corrections towards their targets without a jump.
+
+        The result is False if there are neither corrections nor targets.
+        """
         gain = 1.0 - exp(-(t_ns - (self._before_ns or t_ns)) * 1e-9 / CORRECTION_S)
         self._before_ns = t_ns
         if not targets and not self.corrections:

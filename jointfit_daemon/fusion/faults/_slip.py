@@ -3,8 +3,8 @@
 The calibration predicts the rotation between two sensors of a segment from posture
 (`limb_model.SensorLink`). The *difference* of the pair is the measured minus the predicted rotation
 vector. If it exceeds the usual difference, the uncertainty increases immediately. The pair is
-reported as inconsistent only if the difference stays above a limit. It is reported as consistent
-again after the difference has been well below the limit for a longer time.
+reported as inconsistent only if the difference stays above a limit for `ONSET_NS`. The pair is
+reported as consistent again after the difference has been well below the limit for `RELEASE_NS`.
 """
 
 from __future__ import annotations

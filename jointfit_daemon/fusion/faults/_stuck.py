@@ -84,7 +84,7 @@ class _SensorHistory:
         self.natural_ns = 0
         self.repeating = self.lagging = self.still = False
         self.repeated_ns = 0
-        """Last instant at which the sensor repeated itself."""
+        """Last instant at which the sensor repeated its orientation."""
 
     def update(self, t_ns: int, q: Quaternion, orientations: Orientations) -> bool:
         """Add an orientation; return whether it equals the preceding orientation."""

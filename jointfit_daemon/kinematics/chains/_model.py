@@ -170,7 +170,7 @@ class ChainModel:
 
     @cached_property
     def columns(self) -> tuple[slice, ...]:
-        """Columns of each segment in a step of all coordinates; rotations precede translations."""
+        """Columns of each segment in a step of the state; rotations precede translations."""
         ends = np.cumsum([0, *(DEGREES_OF_FREEDOM[s.joint.kind] for s in self.segments)]).tolist()
         return tuple(slice(a, b) for a, b in pairwise(ends))
 

@@ -131,7 +131,7 @@ class CoordinateTracker:
             if state.couplings is not None:
                 values[self._rows[i]] = state.couplings[0, c, 0]
 
-        # `_closed` contains hinges first.
+        # In `_closed` the hinges precede the other joints.
         turned = (self._left @ state.rotations[0, self._closed] @ self._right).tolist()
         count = len(self._hinges)
         if count:
@@ -230,7 +230,10 @@ class _Shift(NamedTuple):
     def of(
         cls, form: ClosedForm, segment: int, free: list[int], first: int, column: int
     ) -> _Shift | None:
-        """Return the translations of a free joint, which start at coordinate `first`, or None."""
+        """Return the translations of a free joint; None if the joint is not free.
+
+        `first` is the index of the first coordinate of the joint, `column` its first column.
+        """
         if form.shift_inverse is None or form.start is None or form.center is None:
             return None
         center = form.center if np.abs(form.center).max() > _NO_OFFSET_M else None

@@ -2,7 +2,8 @@ r"""Levenberg-Marquardt search over many instants, each of which has its own dam
 
 Invariant: a step is accepted only at instants where the step lowers the cost. At other instants the
 damping is increased. Converged instants take no further steps. If no damped step lowers the cost,
-as at the jump of a band at half a turn, the search ends, but the instant has not converged.
+the search ends, but the instant has not converged. This happens where a joint is rotated by 180
+degrees from the reference of a band (see below), because the penalty of the band jumps there.
 
 In addition to the marker errors the cost contains *bands*, which penalize joint rotations outside a
 range:

@@ -286,7 +286,10 @@ class LiveInverseKinematics:
     def _one_step(
         self, place: _Place, equations: _Equations, measured: Array, weights: Array, tries: int
     ) -> tuple[Array, _Place]:
-        """Return a step that does not raise the cost, and the state after this step."""
+        """Return a step that does not raise the cost beyond a tolerance, and the state after it.
+
+        The step is zero if every tried step raises the cost.
+        """
         factor, damping = equations.factor, 0.0
         most = place.cost * (1.0 + (_OPEN_SLACK if equations.is_open else _ROUNDING))
         for _ in range(tries):
@@ -303,7 +306,7 @@ class LiveInverseKinematics:
         residuals = self._slots.from_slots(place.at.errors)[0]
         residuals[~seen] = np.nan
         self._learn(place.cost, int(seen.sum()))
-        # dpotri would start threads even for small matrices
+        # dpotrs is used because dpotri starts threads even for small matrices
         inverse = lapack.dpotrs(place.factor, self._identity, lower=1)[0]
         determined = inverse.diagonal() * OPEN_M2 * self._typical <= 1.0
         covariance = self._variance * inverse

@@ -96,7 +96,7 @@ class JournalHandler(RateLimitedHandler):
     address
         Path of journald's socket.
     stream, clock
-        As in `RateLimitedHandler`.
+        Parameters of `RateLimitedHandler`.
     """
 
     def __init__(

@@ -152,7 +152,7 @@ def _frames(health: BridgeHealth, frames: FrameStatistics) -> Iterator[Metric]:
 
 
 def _device_details(devices: Mapping[str, DeviceHealth]) -> Iterator[Metric]:
-    """Yield the metric families of devices that have a second label."""
+    """Yield the metric families of devices whose metrics have a second label."""
     samples = CounterMetricFamily(
         "jointfit_device_samples",
         "Samples by outcome: used, decimated, idle, late, duplicate, dropped.",

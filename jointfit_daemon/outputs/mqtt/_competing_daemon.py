@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 SHORT_S = 5.0
 """Connection time after which a daemon counts as established and earlier losses are ignored, s."""
 NEWCOMER_S = 0.25
-"""Limit for the duration of the first connection after one loss, s. The other daemon needs only a
+"""Limit, after one loss, for the duration of the first connection, s. The other daemon needs only a
 fraction of this time to reconnect."""
 UNEXPLAINED = 3
 """Number of consecutive short connections, ended without a reason from the broker, after which
@@ -87,7 +87,9 @@ class TakeoverDetector:
 
 
 async def is_in_use(settings: MqttSettings, offline: bytes) -> bool:
-    """Return whether another daemon publishes poses below this base.
+    """Return whether another daemon publishes poses below the base topic.
+
+    `offline` is the payload of the state of a stopped daemon.
 
     If a daemon ends without disconnecting, the broker keeps the state ``online`` for some seconds.
     This state therefore only extends the wait for a pose.
@@ -118,7 +120,7 @@ async def is_in_use(settings: MqttSettings, offline: bytes) -> bool:
 
 
 async def is_publishing(settings: MqttSettings, within_s: float) -> bool:
-    """Return whether a pose arrives below the base topic while this daemon is disconnected.
+    """Return whether a pose arrives within `within_s` while this daemon is disconnected.
 
     Raises
     ------

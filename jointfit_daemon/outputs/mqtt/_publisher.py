@@ -50,7 +50,7 @@ log = logging.getLogger(__name__)
 
 ECHO_S = 5.0
 """Time within which the broker must return the daemon's own message, s. If the message does not
-come back, the broker's access list may forbid it."""
+come back, the broker's access list may forbid its publication or delivery."""
 REQUEST_RATE_HZ = 10.0
 """Permitted mean rate of requests, 1/s. A person needs several seconds per request."""
 REQUEST_BURST = 20.0
@@ -263,7 +263,8 @@ class MqttPublisher:
         if lasted_s > 0.0 and self._taken_over:
             reason = self._contested
         elif lasted_s > 0.0 and (CONNECTION_LOST in reason or CONNECTION_CLOSED in reason):
-            # Which operation fails first is random, and a takeover causes the same error.
+            # The text of the error depends on the operation that fails first, which is random. A
+            # takeover without a reason causes the same errors.
             reason = (
                 f"broker {self._settings.host}:{self._settings.tcp_port}: the connection ended "
                 "without a reason: the broker stopped, the network failed, or another client uses "

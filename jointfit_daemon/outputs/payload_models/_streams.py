@@ -14,7 +14,7 @@ Time = int
 
 
 class Table(BaseModel):
-    """A table of a payload; the tests refuse keys that it does not name."""
+    """A table of a payload; the tests reject keys that its model does not define."""
 
     model_config = ConfigDict(extra="forbid", strict=False)
 

@@ -236,7 +236,8 @@ def _read_chunk(start: int, end: int, content: bytes) -> Block:
 
     data = chunk.data
     if chunk.compression == "zstd":
-        # A compressed frame that declares a size other than the chunk's could expand to any size.
+        # If the declared sizes of the zstd data and of the chunk differ, the data could expand to
+        # any size.
         if zstandard.get_frame_parameters(data).content_size != chunk.uncompressed_size:
             raise _DamageError("the compressed size of a chunk contradicts its content")
         # A new decompressor is used, because a shared decompressor is not thread-safe.

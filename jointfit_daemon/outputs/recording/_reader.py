@@ -1,4 +1,4 @@
-"""Reader of recordings, including damaged ones and recordings of a crashed or running daemon.
+"""Reader of recordings, including damaged recordings and those of a crashed or running daemon.
 
 Invariant: messages are returned in the order in which the daemon processed them. Each missing
 message is part of exactly one `RecordingGap`.
@@ -107,7 +107,7 @@ def _channel_parts(channel: str) -> tuple[str, str]:
 
 @dataclass(frozen=True)
 class RecordedPart:
-    """One file of a recording that can be read."""
+    """One readable file of a recording."""
 
     path: Path
     info: RecordingInfo

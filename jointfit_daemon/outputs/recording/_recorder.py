@@ -68,7 +68,7 @@ class RecordingHealth:
     free_bytes: int | None = None
     """Free disk space for recordings, bytes; None while unknown."""
     active: bool = False
-    """Whether the recorder is running."""
+    """Whether a recording is running."""
 
 
 class Recorder:

@@ -52,7 +52,8 @@ four IMUs. Later messages are lost."""
 RETRY_S = 1.0
 """Interval between attempts to create a file, s."""
 ABANDON_S = 5.0
-"""Time after which an unwritable file is replaced by a new file, s."""
+"""Time after which an unwritable file is replaced by a new file, s. A file that has reached the
+largest permitted size (EFBIG) is replaced at once."""
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 """Errors that end when files are deleted. With these errors the file is not replaced."""
 _YIELD_MESSAGES, _YIELD_S = 32, 0.0005

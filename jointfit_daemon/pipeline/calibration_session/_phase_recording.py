@@ -37,8 +37,8 @@ class PhaseRecording:
     ----------
     phase : CalibrationPhase
         Phase to record. ``static`` ends after `wanted_s` of stillness, and ``align`` after
-        `wanted_s`. ``functional`` ends when all conditions of the guide hold, but after `wanted_s`
-        at the latest.
+        `wanted_s`. ``functional`` ends when all conditions of the guide hold, but not before
+        `min_s`, and after `wanted_s` at the latest.
     chain : Chain
         Limb whose sensors take part.
     start_ns : int
@@ -122,7 +122,8 @@ class PhaseRecording:
     ) -> tuple[float, str, dict[str, object]]:
         """Return the progress of a functional phase.
 
-        It is 1 when all conditions hold, or after the longest duration.
+        The progress is 1 after the longest duration. It is 1 earlier if all conditions hold, no
+        source is silent, and the shortest duration has passed.
         """
         latest = {name: q for name, q in self._latest.items() if name not in silent}
         look = self._look = guide.update(latest, elapsed_s)

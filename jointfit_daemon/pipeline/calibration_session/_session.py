@@ -251,7 +251,7 @@ class CalibrationSession:
         ]
 
     def _revert_refits(self, request: Request) -> list[Output]:
-        """Restore the models from before online learning, and pause it until a functional phase."""
+        """Restore the models from before online learning; pause it until a functional phase."""
         now, running = self.calibration, self._state not in RESTING
         before = None if now is None or running else self.refits.revert(now)
         if before is None:
@@ -269,8 +269,8 @@ class CalibrationSession:
     def select(self, event: CalibrationSelected) -> list[Output]:
         """Use a stored calibration, and pause online learning until the next functional phase.
 
-        The calibration is stored again as a new version, because the daemon uses
-        the newest version after a restart.
+        The calibration is stored again as a new version, because the daemon uses the newest version
+        after a restart.
         """
         request, chosen = event.request, event.calibration
         if self._state not in RESTING:

@@ -1,9 +1,9 @@
 """Search for exchanged labels by the shapes of the segments of a chain model.
 
 If markers on the last segment of a chain are exchanged, inverse kinematics rotates this segment
-until they fit best. In this wrong pose, other markers seem to be exchanged, or only some markers
-have large errors. The shape of the segment's marker cluster does not depend on the pose, so the
-search compares shapes.
+until its markers fit best. In this wrong pose, other markers seem to be exchanged, or only some
+markers have large errors. The shape of the segment's marker cluster does not depend on the pose, so
+the search compares shapes.
 
 Invariant: the computation per frame is limited, so a search takes several frames. The last result
 is valid until the next result.

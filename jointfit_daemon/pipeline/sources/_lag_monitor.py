@@ -40,8 +40,8 @@ WINDOW_NS = 10_000_000_000
 HOP_NS = 2_500_000_000
 """Time between the starts of successive windows, ns."""
 MARGIN_NS = 300_000_000
-"""Time before and after the window, ns. Its samples are used as well, because of the lag and of the
-filter at the ends of the window."""
+"""Length of the margins before and after the window, ns. Samples in the margins are used as well,
+because of the lag and of the filter at the ends of the window."""
 DRIFT_FAULT = 2e-6
 """Drift of the lag between two synchronized clocks, ns/ns. A larger drift means that a clock fit is
 wrong."""

@@ -81,7 +81,7 @@ class SourceState:
         """Return the state of a source that is not open yet.
 
         If `before` is the state of the same id before a reload, its counts are continued. The frame
-        grid also continues the counts of the samples, and both must agree.
+        grid also continues its counts of the samples, and the two counts must agree.
         """
         mean_ns, sd_ns = latency_prior(source)
         period_ns = round(NS_PER_S / source.rate_hz)

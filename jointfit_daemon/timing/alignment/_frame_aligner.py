@@ -12,8 +12,8 @@ time do not contain the stream.
 
 Invariant: frames never stop. While no stream has samples, frames without orientations are emitted.
 The first of these frames is emitted when every stream counts as lost. Each later frame waits for
-the usual delay of the streams. Such frames are skipped only if the whole process was stopped for
-more than a second, so that the caller could not request them.
+the usual delay of the streams. Frames without orientations are skipped only if the whole process
+was stopped for more than a second, so that the caller could not request them.
 
 In mode ``fast`` a frame is complete if the last sample of each stream precedes t_k by at most one
 period of the stream. The orientation is extrapolated to t_k. Frames are therefore emitted up to one
@@ -52,8 +52,8 @@ class AlignedFrame(NamedTuple):
     extrapolated: frozenset[str]
     missing: frozenset[str]
     synced: bool
-    """Whether the clocks of all `orientations` have settled. A frame without orientations has the
-    value of the last frame with orientations. The value is False when all streams have ended.
+    """Whether the clocks of all `orientations` have settled. A frame without orientations repeats
+    the value of the last frame with orientations. After all streams have ended, it is False.
     """
 
 
@@ -97,8 +97,8 @@ class FrameAligner:
         self._fast = mode == "fast"
         self._next = None if begin_ns is None else -(-begin_ns // period_ns)
         """Number k of the next frame; None before the first sample."""
-        self._served: int | None = None  # number of a frame for which a stream has data
-        self._serves_ns: int | None = None  # first instant for which a stream has data
+        self._served: int | None = None  # number k of a frame with data
+        self._serves_ns: int | None = None  # first instant with data, from the next frame on
         self._completed_ns = 0
         self._synced = False
         """Whether the clocks of the last frame had settled."""
@@ -197,7 +197,7 @@ class FrameAligner:
         return frames
 
     def _lacks_sample(self) -> bool:
-        """Return whether an expected stream has no sample at or after the next frame."""
+        """Return whether an expected stream lacks the sample that completes the next frame."""
         t_k = (self._next or 0) * self._period_ns
         return any(
             stream.waited_for and stream.newest_ns < (t_k - stream.period_ns if self._fast else t_k)

@@ -52,9 +52,10 @@ def interpolate_orientation(
     .. math:: r(x) = r_b \frac{x (x + h_0)}{h_1 (h_0 + h_1)}
               + r_0 \frac{x (x - h_1)}{h_0 (h_0 + h_1)}
 
-    where :math:`h_0, h_1` are the intervals before and after `a`. Without `before` the result is a
-    spherical linear interpolation (slerp). The error of the parabola is of third order in the
-    interval, and the error of slerp is of second order.
+    where x is the time since `a`, :math:`h_0, h_1` are the intervals before and after `a`, and
+    :math:`r_0, r_b` are the vectors of `before` and `b` in the tangent space of `a`. Without
+    `before` the result is a spherical linear interpolation (slerp). The error of the parabola is of
+    third order in the interval, and the error of slerp is of second order.
 
     Parameters
     ----------
@@ -92,10 +93,10 @@ def extrapolate_orientation(
     .. math:: r(x) = v x + \beta\, d\, (x_c (x_c + h_0) + (2 x_c + h_0)(x - x_c)),
               \quad x_c = \min(x, h_0)
 
-    where *v* is the rate of the last interval, :math:`h_0` the length of this interval, *d* the
-    second divided difference (half the angular acceleration), and :math:`\beta` = 1/2. A larger
-    :math:`\beta` follows faster motion but amplifies noise (docs/timing.md). With measured rates,
-    the whole angular acceleration continues.
+    where *x* is the time since `a`, *v* the rate of the last interval, :math:`h_0` the length of
+    this interval, *d* the second divided difference (half the angular acceleration), and
+    :math:`\beta` = 1/2. A larger :math:`\beta` follows faster motion but amplifies noise
+    (docs/timing.md). With measured rates, the whole angular acceleration continues.
 
     Parameters
     ----------

@@ -14,7 +14,7 @@ class RateDivider:
     For every time of a regular grid, the first frame at or after this time is selected. The mean
     rate is therefore `rate_hz`, even if no frame lies exactly on a grid time. The grid restarts
     after a pause. It also restarts after a timestamp far in the future, which would otherwise
-    exclude all frames up to its time.
+    exclude all frames with earlier timestamps.
 
     Parameters
     ----------

@@ -43,7 +43,8 @@ DELAY_MOST_NS = 250_000_000
 
 _EARLY = 20
 """The deadline of a frame is computed from the first sample whose expected instant is after the
-frame, or at most 1/20 period before it. With jitter, the real instant may then be after the frame.
+frame, or at most 1/20 period before the frame. With jitter, the real instant of such a sample may
+be after the frame.
 """
 _DELAY_STEP = 128
 """The usual delay decreases by at most 1/128 period per sample."""
@@ -69,8 +70,8 @@ class SampleOutcome(StrEnum):
     DROPPED = "dropped"
     """Sample discarded because of overflow, reset, close, or a timestamp in the future."""
     IDLE = "idle"
-    """Mocap frame that no calibration phase records, and from which the position of O1 is not
-    computed. A stream never has this outcome.
+    """Mocap frame that no calibration phase records, and from which the position of the first joint
+    is not computed. A sample of a stream never has this outcome.
     """
 
 
@@ -201,7 +202,11 @@ class Stream:
         return t_ns if before is not None and t_ns - before.t_ns <= self._reach_ns else None
 
     def due(self, t_ns: int) -> int:
-        """Return the arrival of the first sample at or after `t_ns`, or the deadline, ns."""
+        """Return the arrival of the first sample at or after `t_ns`, ns.
+
+        If this sample has not arrived, return the deadline of the stream for the frame at `t_ns`.
+        If no more samples are expected, return `t_ns`.
+        """
         if not self.waited_for:
             return t_ns  # no frame is published before its instant
         newest = self.newest_ns

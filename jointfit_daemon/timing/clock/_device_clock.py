@@ -54,8 +54,9 @@ AWAY_SLACK_NS = 500_000_000
 while the port was closed.
 """
 AWAY_TURNS = 20
-"""Least period of the device readings for the detection of a restart, in units of the tolerance.
-Readings with a shorter period would hide a restart by chance in more than one of ten cases.
+"""Least period of the device readings for the detection of a restart, in multiples of the tolerance
+of the first device time after the port was closed. Readings with a shorter period would hide a
+restart by chance in more than one of ten cases.
 """
 
 _ARRIVAL, _COUNTER, _TICKS = range(3)
@@ -393,7 +394,7 @@ class DeviceClock:
         if envelope.settled:
             return doubts.feed(excess, envelope.sigma_ns(u), arrival_ns)
         if excess < 0.0:
-            # The samples before were read from stale bytes, up to seconds after their arrival, so
+            # The previous samples were read from stale bytes, up to seconds after their arrival, so
             # the fit is discarded.
             self._envelope = MinimumDelayFilter(NOMINAL_RATE if self._kind != _TICKS else CRYSTAL)
         return None

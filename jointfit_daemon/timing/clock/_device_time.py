@@ -48,7 +48,9 @@ the first wrap. If a quarter of the elapsed time is larger, this quarter is the 
 _LATE = 0.65
 """Delay from which a sample counts as late, periods."""
 _DOUBTFUL = 0.35
-"""Largest distance of a delay from whole periods that is accepted as lost samples, periods."""
+"""Largest distance of a delay from a whole number of periods at which lost samples explain the
+delay, periods.
+"""
 _LATE_LEAST_NS = 50_000_000
 """Least duration of lateness before samples count as lost, ns."""
 _LATE_PERIODS = 3
@@ -86,7 +88,7 @@ def _has_backlog_ended(
 
     The sample before was then late, and this sample is not. According to the settled clock, this
     sample was therefore taken before its arrival. After a jump of the device clock without a
-    backlog, the clock would return a sampling instant after the arrival.
+    backlog, the settled clock would return a sampling instant after the arrival.
     """
     if ahead_ns <= _BACKLOG_NS:
         return False

@@ -2,10 +2,10 @@
 
 An echo is sent at host time a, answered with server time u, and received at host time b. The clock
 offset is ``theta = u - (a + b)/2``, with an error of at most half the round-trip time ``rho = b -
-a``. The line ``theta(m) = theta_0 + s (m - m_0)`` is fitted to the echoes with round-trip times
-near the minimum. The method is weighted least squares with Huber weights. A prior on the skew s
-keeps s small in the first seconds. The error of theta_0 is half the difference between the delays
-of request and reply; ``bound_ns`` is the limit of this error.
+a``. Over the host time m, the line ``theta(m) = theta_0 + s (m - m_0)`` is fitted to the echoes
+with round-trip times near the minimum. The method is weighted least squares with Huber weights. A
+prior on the skew s keeps s small in the first seconds. The error of theta_0 is half the difference
+between the delays of request and reply; ``bound_ns`` is the limit of this error.
 
 Invariant: a single wrong or forged echo does not change a settled fit. An echo that contradicts the
 fit is not used. If the next echo agrees with this echo, the server clock was restarted.
@@ -75,7 +75,7 @@ class EchoFit:
 
     @property
     def last_ns(self) -> int | None:
-        """Host time of the last echo; None before the first echo."""
+        """Host time of the last echo, ns; None before the first echo."""
         return self._echoes[-1].middle_ns if self._echoes else None
 
     def expects_more(self, now_ns: int) -> bool:
@@ -96,7 +96,7 @@ class EchoFit:
         return abs(u - self.device_ns(middle)) > (received_ns - sent_ns) / 2 + JUMP_NS
 
     def confirms_restart(self, u: int, sent_ns: int, received_ns: int) -> bool:
-        """Store a contradicting echo; return whether the preceding echo agrees with it."""
+        """Store a contradicting echo; return whether the contradicting echo before it agrees."""
         middle = (sent_ns + received_ns) // 2
         before = self._doubtful
         self._doubtful = now = _Echo(middle, u - middle, received_ns - sent_ns)

@@ -140,8 +140,8 @@ def _on_time(
 ) -> Sequence[Point]:
     """Return the points that were not delayed by congestion.
 
-    Heights are measured above the hull. An outer edge of the hull ends at a delayed point if its
-    slope is outside the likely range from `near` to `far`. The hull is continued in place of such
+    Heights are measured above the hull. An outer edge of the hull ends at a delayed point if the
+    slope of the edge is outside the likely range from `near` to `far`. Such an edge is replaced by
     an edge with the slope `near` on the left or `far` on the right.
     """
     u0, tilt = points[0][0], _slope(points[0], points[-1])

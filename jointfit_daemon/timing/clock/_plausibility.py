@@ -78,7 +78,7 @@ class PlausibilityMonitor:
         Parameters
         ----------
         excess_ns : float
-            Delay relative to the fastest samples, ns; a negative value is too early.
+            Delay relative to the fastest samples, ns; negative if the sample is early.
         sigma_ns : float
             Standard deviation of the clock estimate, ns.
         arrival_ns : int

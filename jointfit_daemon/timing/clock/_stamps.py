@@ -56,7 +56,7 @@ class MonotonicStamps:
         """Device time of the last sample in order, ns; None after a restart."""
         self.last_t: int | None = None
         """Last timestamp, ns. A restart does not reset it, so that timestamps never decrease."""
-        self._newest: int | None = None  # includes samples without device time
+        self._newest: int | None = None  # last timestamp, also without device time
 
     @property
     def offset_ns(self) -> int | None:

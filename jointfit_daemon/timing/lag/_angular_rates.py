@@ -53,7 +53,7 @@ class Rates:
     """Fraction of the track's duration that the rates cover."""
 
     def runs(self) -> list[slice]:
-        """Return the gapless runs."""
+        """Return the gapless runs as slices of the samples."""
         edges = np.flatnonzero(np.diff(self.run)) + 1
         bounds = [0, *edges.tolist(), self.run.size]
         return [slice(a, b) for a, b in pairwise(bounds) if b > a]
@@ -163,7 +163,7 @@ class Interpolant:
                 slopes[2:-2] = (w[:-4] - w[4:] + 8.0 * (w[3:-1] - w[1:-3])) / (12.0 * h)
 
     def locate(self, t: Floats) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-        """Return the index of the sample interval of each instant, and whether a run covers it."""
+        """Return the index of each instant's sample interval, and whether a run covers `t`."""
         at, inside, _, _ = self._intervals(t)
         return at, inside
 

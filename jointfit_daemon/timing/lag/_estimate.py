@@ -47,7 +47,7 @@ NO_OVERLAP = "the tracks do not overlap"
 _NYQUIST_SHARE = 0.4
 """Largest cut-off frequency as a fraction of the lower sample rate."""
 _LEAST_OVERLAP = 0.5
-"""Least overlap of the tracks, as a fraction of the reference, for a correlation."""
+"""Least overlap of the tracks for a correlation, as a fraction of the valid reference samples."""
 _CANDIDATE = 0.5
 """Fraction of the best correlation above which a maximum is fitted."""
 _CANDIDATES = 4

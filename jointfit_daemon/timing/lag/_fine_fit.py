@@ -73,9 +73,10 @@ def fit_lag(
 ) -> Generator[None, None, LagFit | None]:
     r"""Fit :math:`r_j = g(t_j + \tau) - b - R\omega_j` over (R, b, tau).
 
-    The method is a Gauss-Newton iteration over all seven unknowns, with Huber weights on |r|. The
-    threshold with the smallest variance of the lag is selected. The faster track is interpolated at
-    the instants of the slower track.
+    The symbols are defined in ``_estimate``. The method is a Gauss-Newton iteration over all seven
+    unknowns, with Huber weights on |r|. The Huber threshold with the smallest variance of the lag
+    is selected. The track with the higher sample rate is interpolated at the instants of the other
+    track.
 
     Parameters
     ----------
@@ -187,7 +188,7 @@ def _norms(vectors: Floats) -> Floats:
 
 def _scale(norm: Floats) -> float:
     """Return the robust standard deviation per axis of residuals, from their norms."""
-    # The median of finite values takes half the time of ``np.median``.
+    # This median is valid for finite values only, and takes half the time of ``np.median``.
     middle = norm.size // 2
     if norm.size % 2:
         median = float(np.partition(norm, middle)[middle])

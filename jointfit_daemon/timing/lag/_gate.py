@@ -9,9 +9,9 @@ remedy, and appears in ``tracked_refused`` and ``quality.lag.ID.refused``. The c
    (`fit_fault`).
 
 The thresholds depend on the phase. The defaults of `LagSettings` are for live tracking.
-``calibration/registration/_lags.py`` contains the thresholds for plate and body.
-Two other decisions are not made here. ``_tracker`` detects steps of accepted lags, and
-``pipeline/sources/_lag_monitor.py`` reports lags that contradict the lag in use.
+``calibration/registration/_lags.py`` contains the thresholds for sensors on the calibration plate
+and on the body. Two other decisions are not made here. ``_tracker`` detects steps of accepted lags,
+and ``pipeline/sources/_lag_monitor.py`` reports lags that contradict the lag in use.
 """
 
 from __future__ import annotations

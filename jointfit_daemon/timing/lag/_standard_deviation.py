@@ -27,11 +27,12 @@ the variance is
 .. math:: \sigma_s^2 G, \quad G = \frac{6}{\pi^2} \sum_{k=1}^{3} \frac{|H(k/P)|^2}{k^2}, \quad
           H(f) = \frac{\sum h_j e^{2\pi i f t_j}}{\sum h_j},
 
-where G is the power of the harmonics of a sawtooth of period P, weighted with the information h,
-and :math:`\sigma_s` is the standard deviation of the sawtooth. The jackknife already contains the
-scatter of the sawtooth between blocks, :math:`\sigma_s^2 (1 - G) \sum p_b^2`, where p_b is the
-fraction of the information in a block. The difference of the two variances is added. It is zero if
-the motion is uniform over the window.
+where G is the power of the harmonics of a sawtooth of period P, weighted with the information h_j
+of the sample at the instant t_j, and :math:`\sigma_s` is the standard deviation of the sawtooth.
+The jackknife already contains the scatter of the sawtooth between blocks, :math:`\sigma_s^2 (1 - G)
+\sum p_b^2`, where p_b is the fraction of the information in block b of the filter length. The
+difference of the two variances is added. This difference is zero if the motion is uniform over the
+window.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ AGREE_NS = 500_000.0
 
 @dataclass(frozen=True, slots=True)
 class TrackedLag:
-    """Lag after a window."""
+    """Tracked lag after the update with one window."""
 
     lag_ns: float
     sigma_ns: float

@@ -46,9 +46,9 @@ def batch(
 ) -> None:
     """Process every recording of a folder, and summarize the results in a table.
 
-    A repeated batch skips every recording that it has already processed, unless the bytes of the
+    The command skips every recording that an earlier run has processed, unless the bytes of the
     recording, the steps, the formats or the version of this program changed. Exit codes: 0 all
-    recordings are processed; 1 at least one failed.
+    recordings are processed; 1 at least one recording failed or has a different replay.
     """
     from jointfit_daemon.files.sessions import SESSION_FORMATS
     from jointfit_daemon.tools.batch.executors import run_in_pool, run_on_cluster
@@ -97,7 +97,13 @@ def _report_progress(running: Iterator[RecordingResult], total: int) -> list[Rec
 
 
 def _words(option: str, text: str, choices: Sequence[str]) -> tuple[str, ...]:
-    """Return the words of a comma-separated list, in the order of `choices`."""
+    """Return the words of a comma-separated list, in the order of `choices`.
+
+    Raises
+    ------
+    ValueError
+        The list is empty, or a word is not one of `choices`.
+    """
     words = [word.strip() for word in text.split(",") if word.strip()]
     for word in words or [""]:
         check_choice(option, word, choices)

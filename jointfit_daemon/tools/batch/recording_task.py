@@ -1,4 +1,4 @@
-"""Processing of one recording of a batch, in this process or another.
+"""Processing of one recording of a batch, in this process or in another process.
 
 Invariant: the output files depend only on the bytes of the recording, the steps, the formats and
 the software version. All files become visible together, after all steps have succeeded.
@@ -59,7 +59,7 @@ class RecordingResult:
     angle: str = ""
     """Name of the joint angle to which `rms_deg` refers."""
     rms_deg: float | None = None
-    """RMS difference between sensors and cameras in this angle, degrees."""
+    """RMS difference of the angle `angle` between sensors and cameras, degrees."""
     range_deg: float | None = None
     """Largest range of motion among all angles, degrees."""
     gait_cycles: int | None = None
@@ -67,7 +67,7 @@ class RecordingResult:
     """Share of lost samples of the source with the largest loss, percent."""
     faults: int | None = None
     verified: str = ""
-    """Result of the step ``replay``."""
+    """Result of the step ``replay`` as text; empty if this step is not part of the task."""
     gaps: str = ""
     """Missing parts of the recording."""
     notes: str = ""
@@ -99,7 +99,7 @@ def finished_result(task: RecordingTask, digest: str) -> RecordingResult | None:
             return None
         return RecordingResult(**stored)
     except (OSError, ValueError, TypeError, KeyError):
-        return None  # there is no mark, or its format is of another version
+        return None  # the mark does not exist, or another version of this program wrote the mark
 
 
 def process_recording(task: RecordingTask) -> RecordingResult:
@@ -172,7 +172,7 @@ def _run_steps(task: RecordingTask, folder: Path) -> RecordingResult:
 
 
 def _calibrate(recording: Path, folder: Path, notes: list[str]) -> Calibration | None:
-    """Calibrate from a recording. Without a calibration as result, add a note and return None."""
+    """Write and return the calibration; if the recording yields none, add a note instead."""
     from jointfit_daemon.reprocessing import ReprocessingError, calibrate_recording
     from jointfit_daemon.tools.calibrate import store_offline_calibration
 

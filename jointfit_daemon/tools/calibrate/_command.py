@@ -253,8 +253,8 @@ async def _await_answer(
     Raises
     ------
     NoAnswerError
-        Neither an answer nor a status of the phase arrived. If the daemon may still receive the
-        request, an abort request is sent.
+        No answer arrived, and no status of a requested phase. In the case of a phase, an abort
+        request was sent, because the daemon may still receive the first request.
     """
     from jointfit_daemon.outputs.mqtt import BrokerLostError, NoAnswerError
 

@@ -92,7 +92,7 @@ class PhaseTracker:
             self.show_details(payload.get("data") or {})
 
     def on_state(self, state: object) -> str | None:
-        """Process the state in a message of topic ``bridge/state``; return a line for the user."""
+        """Process the state in a message ``bridge/state``; return a line for the user, or None."""
         before = self._offline_until
         if state == "online":
             self._offline_until = None
@@ -169,7 +169,7 @@ class PhaseTracker:
     async def wait_for_final(self, phase: str) -> Mapping[str, Any]:
         """Return the status after the end of `phase`.
 
-        A phase that was not aborted has `STORING_S` to store its result.
+        If the phase was not aborted, the method waits up to `STORING_S` for the stored result.
         """
         while self.status is self._status_before or self.status.get("phase") in (phase, "fitting"):
             await self._next_message()

@@ -74,8 +74,9 @@ def report(quality: Mapping[str, Any]) -> list[str]:
 def movement_lines(data: Mapping[str, Any]) -> list[str]:
     """Return one line for each joint in ``data`` of topic ``calibration/progress``.
 
-    The first number is the predicted error including the soft-tissue artefact. The second number is
-    the random part of this error, which decreases with more movement.
+    The first number is the predicted error of the joint centre, including the effect of the
+    soft-tissue artefact. The second number is the random part of this error, which decreases with
+    more movement.
     """
     lines = []
     for name, joint in (data.get("joints") or {}).items():
@@ -110,7 +111,10 @@ class ProgressLines:
         self._line = f"{phase}: {100 * share:.0f} %" + (f", {text}" if text else "")
 
     def due(self, now_s: float, data: Mapping[str, Any]) -> list[str]:
-        """Return the lines to print at `now_s`, or none before the interval has passed."""
+        """Return the lines to print at `now_s`, or none before the interval has passed.
+
+        `data` is the ``data`` of the newest message on topic ``calibration/progress``.
+        """
         if now_s < self._next_s:
             return []
         self._next_s = now_s + self.interval_s

@@ -1,7 +1,7 @@
 """Content of the table ``[imu.sensor_calibration]``, and its insertion in a rig.toml.
 
 Only the lines of this table change; comments and the order of the file remain. The changed text is
-parsed and compared with the expected content before the function returns it.
+parsed and compared with the expected content before `insert_table` returns it.
 """
 
 from __future__ import annotations

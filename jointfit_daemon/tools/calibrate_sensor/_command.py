@@ -149,7 +149,7 @@ def _calibratable(rig: Rig, name: str, configured: Source) -> Source:
 
 
 def _named_steps(steps: str | None) -> list[str] | None:
-    """Return the steps in the option ``--steps``; raise ValueError for an unknown step."""
+    """Return the steps in the option ``--steps``, or None; raise ValueError for an unknown step."""
     from jointfit_daemon.tools.calibrate_sensor._guided_steps import STEPS
     from jointfit_daemon.tools.text_output import join_choices
 

@@ -47,8 +47,8 @@ INSTRUCTIONS = {
     "each of its sides has pointed in every direction.",
 }
 GYROSCOPE_SCALE = "gyroscope_scale"
-"""Name of the gyroscope estimate from the rotations between the static poses of the accelerometer.
-"""
+"""Key of the scale and axes of the gyroscope, estimated from the rotations between the static poses
+of the accelerometer step."""
 _SHOW_S = 0.25
 """Time between two updates of the displayed progress, s."""
 
@@ -99,7 +99,7 @@ class ReadingStream:
     Parameters
     ----------
     source
-        Sensor of a rig with settings that support calibration.
+        Sensor of a rig; its settings must support sensor calibration.
     findings
         Object that stores the serial number and the warnings.
     """
@@ -136,7 +136,7 @@ async def run_steps(
     Parameters
     ----------
     source
-        Sensor of a rig with settings that support calibration.
+        Sensor of a rig; its settings must support sensor calibration.
     names
         Steps, keys of `STEPS`.
     display
@@ -204,7 +204,7 @@ def take_recorded(source: Source, names: Sequence[str], chunks: Iterable[Chunk])
     Parameters
     ----------
     source
-        Sensor of the recorded rig with settings that support calibration.
+        Sensor of the recorded rig; its settings must support sensor calibration.
     names
         Steps, keys of `STEPS`.
     chunks

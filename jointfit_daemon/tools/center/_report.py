@@ -105,7 +105,7 @@ def details(answer: WindowEstimate) -> str:
 
 
 def error_seen(answer: WindowEstimate) -> float:
-    """Return the predicted RMS error in the observable directions, m; infinite without any."""
+    """Return the predicted RMS error in the observable directions, m; infinity if none exists."""
     e = answer.estimate
     if len(e.unseen) >= len(e.center):
         return inf

@@ -41,7 +41,8 @@ LEAST_PLANAR = 2
 _FEWEST_FRAMES = 3
 """Smallest number of frames of a window: three points define a circle."""
 _EXCHANGE_RAD = 2.5
-"""Rotation of a planar parent between two frames, rad, above which marker names were exchanged."""
+"""Rotation of a planar parent between two frames, rad. A larger rotation indicates that the names
+of two markers were exchanged."""
 _EXCHANGE_S = 0.1
 """Longest time between two frames that are checked for exchanged names, s."""
 
@@ -69,7 +70,10 @@ class ParentFrameMotion:
     """Parent markers in the parent frame, m, shape (number of markers, d)."""
 
     def to_world(self, center: Array) -> Array:
-        """Return the world position of a parent point, m, shape (3,), at the mean parent pose."""
+        """Return the world position of a point, m, shape (3,), at the mean parent pose.
+
+        `center` is the point in parent coordinates, m, shape (d,).
+        """
         known = visible(self.poses.q) & visible(self.poses.t)
         mean = BodyPoses(
             rotation.average(self.poses.q[known])[None], self.poses.t[known].mean(axis=0)[None]

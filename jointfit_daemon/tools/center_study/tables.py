@@ -25,13 +25,14 @@ if TYPE_CHECKING:
     from jointfit_daemon.center_of_rotation.study import PairMaps, StudyExtension, StudySetup
 
 NEAREST = {"α–σ": 0.3, "r–σ": None, "r–α": 0.15}
-"""Clipping limit that reproduces the published correlations best, m, by pair of quantities."""
+"""Clipping limit that reproduces the published correlations best, m, by pair of quantities; None
+stands for no clipping."""
 CAVEATS = (
     "Three noisy points can be collinear, so the error of the analytic solution has no finite"
     " mean square: single outliers determine the raw correlation, which changes with the seed."
     " The printed table can be approached only with clipped errors and a small box.",
     "Clipping limit and box were chosen so that the results approach the printed table (marked *)."
-    " The publication states neither of them, and not the region and step of the grid. Some of its"
+    " The publication states neither these values nor the region and step of the grid. Some of its"
     " digits are illegible.",
     "At small α the grid has smaller errors than the analytic solution, because its box is centered"
     " on the true center and limits the error: at α = 5° the error equals the box. With three"
@@ -49,7 +50,7 @@ _METHODS = ("predicted", "three frames", "grid", "shifted grid", "bound", "hyper
 
 
 def tables(setup: StudySetup, study: Sequence[PairMaps], more: StudyExtension) -> str:
-    """Return tables of the setup, correlations, errors by arc, other methods, and limits."""
+    """Return setup, correlations, errors by arc, other methods and limitations as text tables."""
     degrees = np.rint(np.rad2deg(setup.steps)).astype(int).tolist()
     medians: list[tuple[str, ...]] = [("α", *more.median_errors)]
     for angle in (a for a in _SHOWN_DEG if a in degrees):
@@ -136,7 +137,20 @@ def _correlations(study: Sequence[PairMaps], grid: str) -> list[tuple[str, ...]]
 
 
 def correlations(pair: PairMaps, grid: str, clip: float | None) -> tuple[float, float]:
-    """Return the correlations prediction–analytic and analytic–grid of a pair of quantities."""
+    """Return two correlations between error maps of a pair of quantities.
+
+    The first correlation is between the predicted errors and the errors of the analytic solution,
+    the second between the errors of the analytic solution and of the grid search.
+
+    Parameters
+    ----------
+    pair
+        Error maps of the pair, m.
+    grid
+        Key of the error map of the grid search.
+    clip
+        Limit to which larger errors are reduced, m; None for no limit.
+    """
     analytic = pair.maps["three frames"]
     return (
         correlation(pair.maps["predicted"], analytic, clip),

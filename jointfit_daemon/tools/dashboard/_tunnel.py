@@ -117,7 +117,8 @@ def connection_fault(error: BaseException) -> str:
     """Return the cause of a failed connection as text."""
     if isinstance(error, ssl.SSLCertVerificationError):
         return verification_fault(error)
-    if isinstance(error, ssl.SSLError | ConnectionResetError):  # reset during the TLS handshake
+    # A broker without TLS may reset the connection during the handshake.
+    if isinstance(error, ssl.SSLError | ConnectionResetError):
         return "the port does not answer to TLS: check the port, or use mqtt://"
     words: dict[type[BaseException], str] = {
         TimeoutError: "the host does not answer: check its address and the network",

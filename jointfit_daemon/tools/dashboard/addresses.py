@@ -77,8 +77,8 @@ def parse_listen(text: str) -> ListenAddress:
 def parse_broker(text: str, account: str = "the page asks for them") -> BrokerAddress:
     """Return the address of ``mqtt://HOST:PORT``, ``mqtts://…``, ``wss://…`` or ``HOST:PORT``.
 
-    A user name in the address raises an error. `account` is the last part of its message, which
-    describes where the user enters the name.
+    `account` is the last part of the error message about a user name in the address. This part
+    states where the user enters name and password.
 
     Raises
     ------

@@ -108,7 +108,7 @@ class DashboardServer:
         method = getattr(request, "method", "GET")  # old versions of websockets accept GET only
         response = self._refusal(request, method) or self._answer(request, method)
         if method == "HEAD" and response is not None:
-            response.body = b""  # the response to HEAD keeps its headers
+            response.body = b""  # the headers are the same as in the response to GET
         return response
 
     def _refusal(self, request: Request, method: str) -> Response | None:
@@ -249,7 +249,7 @@ def _authority(origin: str) -> str | None:
 
 
 def _tokens(headers: Headers, name: str) -> set[str]:
-    """Return, in lower case, the elements of all headers `name` whose weight is not 0."""
+    """Return, in lower case, the elements of all headers `name`, without elements with ``q=0``."""
     elements = ",".join(headers.get_all(name)).lower().split(",")
     parts = [element.replace(" ", "").split(";") for element in elements]
     return {token for token, *weight in parts if weight not in (["q=0"], ["q=0.0"], ["q=0.000"])}

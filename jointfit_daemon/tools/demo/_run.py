@@ -155,7 +155,7 @@ class DemoRun:
             await asyncio.sleep(TRUTH_S)
 
     def _evaluate(self) -> None:
-        """Compare the poses whose ground truth is available."""
+        """Compare each pose with the ground truth as soon as this truth is available."""
         mature = time.monotonic_ns() - MATURE_NS
         while self._poses and self._poses[0][0] < mature:
             t_ns, pose = self._poses.pop(0)
@@ -283,7 +283,7 @@ class DemoRun:
         }
 
     def _center_error_mm(self) -> float | None:
-        """Return the RMS error of the fitted joint centres in the static pose, mm."""
+        """Return the RMS error of the fitted joint centres in the static pose, mm, or None."""
         stored = CalibrationStore(self.folder / CALIBRATIONS, self.rig.calibration_store).latest()
         truth = self.truth.track.at(self._static_ns)
         if stored is None or truth is None:

@@ -102,7 +102,7 @@ class DemoScore:
     """Number of frames whose flexion error is within two published standard deviations."""
 
     def add(self, pose: Mapping[str, object], truth: TrueLimbState, joint: str) -> None:
-        """Compare one ``pose`` payload with the ground truth at its time."""
+        """Compare a ``pose`` payload with `truth`; `joint` selects the joint for the flexion."""
         self.frames += 1
         for name, segment in _table(pose, "segments").items():
             q = segment.get("q")

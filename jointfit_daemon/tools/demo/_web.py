@@ -39,10 +39,10 @@ PHASES = (("align", 20.0), ("static", 5.0), ("functional", 47.0))
 """Phases of the calibration and their durations, s."""
 TOPICS = ("calibration", "calibration/progress", "device/+/availability")
 ATTEMPTS = 3
-"""Number of attempts at each phase. A busy computer delays the simulated sensors, which aborts the
-phase."""
+"""Maximum number of attempts at each phase. A busy computer delays the simulated sensors, and the
+daemon then aborts the phase."""
 STOPPED_BY_USER = "abort requested"
-"""End of the reason for an abort if a user stopped the phase in the page."""
+"""Last words of the abort reason if a user stopped the phase in the page."""
 LIVE = "The page shows the live limb. You can calibrate it again there; Ctrl-C stops the demo."
 UNCALIBRATED = "The limb is not calibrated. Calibrate it in the page; Ctrl-C stops the demo."
 
@@ -105,8 +105,8 @@ def print_address(url: str, listen: ListenAddress) -> None:
 async def _calibrate(rig: Rig, process: ChildProcess) -> str:
     """Run the phases in order, and return the result as text.
 
-    The first phase that is refused or aborted is the last one, for example because the user
-    controls the phases in the page.
+    If a phase is refused or aborted, the later phases are omitted. A possible reason is that the
+    user starts phases in the page.
     """
     from jointfit_daemon.outputs.mqtt import MqttClient
 

@@ -1,8 +1,8 @@
 """Devices of this host: serial ports, CAN interfaces and motion-capture servers.
 
-No function writes to a device or changes it. `find_serial_ports` and `find_can_interfaces` open no
-device, `listen_serial` and `listen_can` open the named device, and `find_mocap_servers` asks over
-the network.
+No function writes to a serial port or CAN interface, or changes its settings permanently.
+`find_serial_ports` and `find_can_interfaces` open no device. `listen_serial` and `listen_can` open
+the named device. `find_mocap_servers` sends requests to servers in the network.
 """
 
 from jointfit_daemon.tools.discovery._can_interfaces import (

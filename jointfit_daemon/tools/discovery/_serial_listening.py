@@ -158,7 +158,7 @@ def _set_speed(descriptor: int, baud: int) -> None:
 
 
 def _receive(descriptor: int, listen_s: float) -> Iterator[Chunk]:
-    """Yield the bytes received within `listen_s`; their time stamps follow the read call."""
+    """Yield the bytes received within `listen_s`; an arrival is the time after the read call."""
     until = time.monotonic() + listen_s
     while (left := until - time.monotonic()) > 0:
         ready, _, _ = select.select([descriptor], [], [], min(left, _POLL_S))

@@ -79,7 +79,10 @@ class DecodedDevice:
 
     @property
     def usual_rate_hz(self) -> int | None:
-        """The rate for rig.toml: a usual rate near the measured rate, or the rounded rate, Hz."""
+        """The rate for rig.toml, Hz: a usual rate near the measured rate, or the rounded rate.
+
+        It is None if no rate was measured.
+        """
         if self.rate_hz is None:
             return None
         nearest = min(_USUAL_RATES, key=lambda rate: abs(rate - (self.rate_hz or 0)))
@@ -152,7 +155,7 @@ def decode_frames(
 def _candidate_tables(
     driver: type[Driver], sizes: Mapping[tuple[int, bool], int]
 ) -> Iterable[Mapping[str, Any]]:
-    """Return the tables that a driver proposes, or the default table without a proposal."""
+    """Return the tables that a driver proposes; if it proposes none, return the default table."""
     if driver.wire != "can" or not sizes:
         return ()
     if hasattr(driver, "candidate_tables"):

@@ -19,7 +19,7 @@ class DoctorReport:
     """All findings, and the most severe level among them."""
 
     level: Level
-    """``error``, ``warning``, or ``ok`` without errors and warnings."""
+    """``error``, ``warning``, or ``ok`` if no finding is an error or a warning."""
     findings: list[Finding]
 
 

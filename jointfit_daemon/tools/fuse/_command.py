@@ -268,7 +268,10 @@ def _inputs(
     markers: Sequence[str] | None,
     up: str,
 ) -> tuple[LimbDescription, list[OfflineTrial], dict[str, Any] | None, list[str]]:
-    """Return limb, trials, sensor alignments and warnings; alignments to be estimated are None."""
+    """Return limb, trials, sensor alignments and warnings.
+
+    The alignments are None if they must be estimated from the trials.
+    """
     from jointfit_daemon.calibration.phases import trial_warnings
     from jointfit_daemon.tools.fuse import _trial
 

@@ -1,7 +1,7 @@
 """Segment lengths and the position of the first joint, from options and from reference files.
 
-Forward kinematics needs both to compute joint positions. Lengths are in m, and positions are in the
-world of the project (z up).
+Forward kinematics computes joint positions from the lengths and this position. Lengths are in m,
+and positions are in the world of the project (z up), m.
 """
 
 from __future__ import annotations
@@ -165,7 +165,7 @@ def placed_joints(chain: Chain, lengths: Sequence[float | None]) -> dict[int, st
 
 
 def left_out_positions(chain: Chain, lengths: Sequence[float | None]) -> str | None:
-    """Return a note on the joints without position, with its remedy; None without such joints."""
+    """Return a note on joints without position, with a remedy; None if all have a position."""
     known = dict(zip(chain.segments, lengths, strict=True))
     unknown = [segment for segment, length in known.items() if length is None]
     if not unknown:

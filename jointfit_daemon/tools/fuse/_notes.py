@@ -39,8 +39,8 @@ def calibration_notes(
             " interpolate each sensor at t + lag first"
         )
 
-    # A model of `jointfit fuse fit` stores no side either, but the user of this command chose the
-    # signs.
+    # A model of `jointfit fuse fit` contains no side either, but the user of this command has
+    # already selected the signs, so a note is not necessary.
     known = left or bool(calibration.left_joints) or "offline" in calibration.quality
     if not known:
         notes.append(

@@ -76,7 +76,7 @@ class FusedPosition:
     position: Array
     """Position, m, shape (n, 3)."""
     sd: Array
-    """Standard deviation per axis, shape (n,)."""
+    """Standard deviation per axis, m, shape (n,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,8 +91,8 @@ class FusedTrial:
     angles: Mapping[str, FusedAngles]
     """Angles of each joint between two segments, by joint."""
     positions: Mapping[str, FusedPosition]
-    """Positions of the joints, by joint, up to the first segment of unknown length. It is empty if
-    the first length is unknown."""
+    """Positions of the joints, by joint, up to the first segment of unknown length. The mapping is
+    empty if the length of the first segment is unknown."""
     flags: Mapping[str, float]
     """Share of frames with each flag, 0 to 1."""
     notes: tuple[str, ...] = ()

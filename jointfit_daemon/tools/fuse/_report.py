@@ -23,7 +23,7 @@ equal."""
 
 
 def evaluation_table(found: MethodEvaluation) -> str:
-    """Return a table of all methods, and a list of results that are worse than the mean method."""
+    """Return a table of all methods, and the errors that exceed those of the method ``mean``."""
     first = found.rows[0]
     head = (
         "trial",
@@ -48,7 +48,7 @@ def _figures(row: MethodScore) -> list[float]:
 
 
 def _comparisons(found: MethodEvaluation) -> list[str]:
-    """Return one line for each fitted method, with its results worse than the mean method."""
+    """Return a line for each fitted method: its errors that exceed those of the method ``mean``."""
     base = {row.trial: row for row in found.rows if row.method == BASELINE}
     worse: dict[str, list[str]] = {}
     for row in found.rows:
@@ -99,7 +99,7 @@ def fit_summary(calibration: Calibration, frames: int) -> str:
 
 
 def fusion_summary(found: FusedTrial) -> str:
-    """Return the shares of frames with known segments and with flags, and missing positions."""
+    """Return the shares of frames with known segments and with flags, and the notes, as text."""
     count = len(found.t_s)
     lines = [f"{count} frames, {found.t_s[-1] - found.t_s[0]:.2f} s"]
     for name, known in found.known.items():

@@ -66,7 +66,7 @@ def read_recording(path: Path, up: Axis) -> OrientationRecording:
     kind = path.suffix.lower()
     if kind == ".npz":
         trial = read_orientations_npz(path)
-        for name, array in read_arrays(path).items():  # `trial` contains them normalized
+        for name, array in read_arrays(path).items():  # quaternions in `trial` are normalized
             if name.endswith("_quat") or name.startswith("q_"):
                 check_unit_norm(path, name, np.asarray(array, dtype=np.float64))
         table = OrientationRecording(trial.t_s, trial.sensors, trial.bones, trial.origins)
@@ -144,7 +144,7 @@ def select_sensors(
 def select_references(
     table: OrientationRecording, names: Sequence[str], path: Path
 ) -> dict[str, Array]:
-    """Return the reference orientations of `names`, or raise `UnusableInputError`."""
+    """Return the references of `names`; raise `UnusableInputError` if a reference is missing."""
     if missing := [name for name in names if name not in table.bones]:
         problems = [unknown_name("reference of segment", name, table.bones) for name in missing]
         raise UnusableInputError(

@@ -289,7 +289,7 @@ def _ns(t_s: Array) -> NDArray[np.int64]:
 
 
 def _at(t_s: Array, q: Array, wanted_s: Array) -> Array:
-    """Interpolate orientations to the times `wanted_s`; times in gaps become NaN."""
+    """Interpolate orientations to the times `wanted_s`; the result is NaN within gaps of `t_s`."""
     if len(t_s) == len(wanted_s) and np.array_equal(t_s, wanted_s):
         return q
     return orientations_at(_ns(t_s), q, _ns(wanted_s))

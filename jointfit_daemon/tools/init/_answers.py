@@ -42,7 +42,7 @@ def sensors_of(answers: Mapping[Key, Any]) -> dict[str, str]:
 
 
 def wiring_of(answers: Mapping[Key, Any], device: str) -> str:
-    """Return the wiring of a device: ``can`` for a bus or an adapter, ``serial`` otherwise."""
+    """Return the wiring of a device: ``can`` for a CAN bus or adapter, ``serial`` otherwise."""
     if device == LATER:
         return "serial"
     return "serial" if "/" in device and device not in answers["can_adapters", ""] else "can"
@@ -77,7 +77,7 @@ def driver_of(answers: Mapping[Key, Any], found: Found, sensor: str) -> ImuDrive
 
 
 def free_sensors(answers: Mapping[Key, Any], found: Found, sensor: str) -> list[CanSensor]:
-    """Return the received sensors on the bus of `sensor` whose identifiers are not in use."""
+    """Return the recognized sensors on the bus of `sensor` whose identifiers are not in use."""
     bus = answers.get(("device", sensor))
     used = {number for each in ids_of_others(answers, sensor) for number in each}
     return [each for each in found.can_sensors.get(str(bus), ()) if used.isdisjoint(each.ids)]
@@ -119,7 +119,9 @@ def choice_of(answers: Mapping[Key, Any], found: Found, subject: str) -> KeyChoi
 
 
 def previous_answer(answers: Mapping[Key, Any], found: Found, question: str, subject: str) -> Any:
-    """Return the answer for the last sensor with the same driver; None if there is none.
+    """Return the answer to `question` for the last sensor before `subject` with the same driver.
+
+    Without such an answer, return None.
 
     `subject` is a sensor, or ``SENSOR.KEY`` for a key of its driver.
     """

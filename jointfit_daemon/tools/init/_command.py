@@ -200,7 +200,7 @@ def _run_dialogue(dialogue: Dialogue, state: Path) -> Answers:
 
 
 def _write_password(path: Path, given: Answers, show: Callable[[str], None]) -> str | None:
-    """Write the broker's password; return the path of its file, or None without an account."""
+    """Write the broker's password; return the path of its file, or None if no file is needed."""
     from jointfit_daemon.tools.init._writing import write_password
 
     name = given.get(("password_file", ""))

@@ -91,7 +91,7 @@ class Dialogue:
         return self.answers
 
     def next(self) -> Asked | None:
-        """Return the next question; a list of devices is updated first."""
+        """Return the next question with an updated list of devices; None if no question is open."""
         asked = self.current_question()
         if asked is None or asked.question.kind != "device":
             return asked
@@ -99,7 +99,10 @@ class Dialogue:
         return self.current_question()
 
     def current_question(self) -> Asked | None:
-        """Return the next question; omit ports that stored answers to later questions use."""
+        """Return the next question, or None if no question is open.
+
+        The list of devices omits ports that stored answers to later questions use.
+        """
         stored = {value for (key, _), value in self._stored.items() if key == "device"}
         taken = stored - {*self.answers.get(("can_adapters", ""), ())}
         free = tuple(port for port in self.found.ports if port.address not in taken)

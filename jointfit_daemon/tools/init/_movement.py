@@ -41,7 +41,7 @@ class _Listener:
     turned_rad: float = 0.0
 
     def take(self, q: tuple[float, ...]) -> None:
-        """Update the largest rotation from the first orientation with the orientation `q`."""
+        """Process an orientation: store the largest rotation relative to the first orientation."""
         if self.start is None:
             self.start = q
         dot = abs(sum(a * b for a, b in zip(self.start, q, strict=True)))
@@ -145,7 +145,7 @@ async def _connect(listeners: Collection[_Listener]) -> None:
 
 
 def _turned_address(listeners: Mapping[str, _Listener]) -> str | None:
-    """Return the address of the only device that was turned."""
+    """Return the address of the only device that was turned; None if no device or several were."""
     first, *others = sorted(listeners.items(), key=lambda entry: entry[1].turned_rad, reverse=True)
     second = others[0][1].turned_rad if others else 0.0
     is_clear = first[1].turned_rad >= TURN_RAD and second <= REST_SHARE * first[1].turned_rad

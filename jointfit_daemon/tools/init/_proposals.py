@@ -67,7 +67,7 @@ def devices(answers: Given, found: Found, _sensor: str) -> tuple[FoundDevice, ..
 
 
 def device(answers: Given, found: Found, sensor: str) -> str | None:
-    """Return the device if one is listed and only one sensor has no device; None otherwise."""
+    """Return the only listed device if only one sensor has no device; otherwise return None."""
     listed = devices(answers, found, sensor)
     waiting = [name for name in sensors_of(answers) if not is_connected(answers, name)]
     return listed[0].address if len(listed) == 1 and len(waiting) == 1 else None
@@ -83,8 +83,8 @@ def unused_port(answers: Given, found: Found, _sensor: str) -> str:
 def baud(answers: Given, found: Found, sensor: str) -> int:
     """Return the speed at which the device answered.
 
-    Otherwise, return the driver's default if it suffices, or else the first higher usual speed that
-    suffices.
+    If no device answered, return the driver's default if it suffices for the sensor rate, or else
+    the first higher usual speed that suffices, or else the highest usual speed.
     """
     known = found.bauds.get(answers["device", sensor])
     if known is not None:
@@ -96,7 +96,10 @@ def baud(answers: Given, found: Found, sensor: str) -> int:
 
 
 def setting(answers: Given, found: Found, subject: str) -> str | None:
-    """Return the value received from the device, or the value of the last sensor of that driver."""
+    """Return the value that the device sends, or the value of the last sensor with its driver.
+
+    If neither value is known, return None.
+    """
     sensor, _, key = subject.rpartition(".")
     name, given = driver_of(answers, found, sensor).name, chosen_settings(answers, sensor)
     for received in free_sensors(answers, found, sensor):
@@ -107,9 +110,10 @@ def setting(answers: Given, found: Found, subject: str) -> str | None:
 
 
 def layout(answers: Given, found: Found, sensor: str) -> str | None:
-    """Return the layout file of the last sensor with the same driver, or None on a CAN bus.
+    """Return the layout file of the last sensor with the same driver, or None.
 
-    Sensors on a CAN bus have different identifiers, so they cannot share a layout file.
+    The result is None if there is no such sensor, and for a sensor on a CAN bus: sensors on a CAN
+    bus have different identifiers, so they cannot share a layout file.
     """
     if driver_of(answers, found, sensor).wiring == "can":
         return None
@@ -118,7 +122,11 @@ def layout(answers: Given, found: Found, sensor: str) -> str | None:
 
 
 def ids(answers: Given, found: Found, sensor: str) -> tuple[int, ...] | None:
-    """Return the first received identifiers that match the driver and that no other sensor uses."""
+    """Return the identifiers of the first free sensor in the received frames, or None.
+
+    A sensor is free if no other sensor of the rig uses its identifiers. It must also match the
+    chosen driver and settings.
+    """
     name, given = driver_of(answers, found, sensor).name, chosen_settings(answers, sensor)
     free = free_sensors(answers, found, sensor)
     return next((each.ids for each in free if each.agrees(name, given)), None)
@@ -154,7 +162,8 @@ def markers(answers: Given, found: Found, part: str) -> tuple[str, ...] | None:
     """Return the streamed marker names that match `part`; without a stream, return usual names.
 
     Marker names that differ only in their last digits form a group. A group matches a body part if
-    its name equals the name of the part or one of the usual prefixes of the part.
+    its name equals the name of the part or one of the usual prefixes of the part. If no group
+    matches, the result is empty for an optional part, and None for a required part.
     """
     if not found.markers:
         return unused_markers(answers, found, part)
@@ -191,7 +200,10 @@ def is_optional(answers: Given, part: str) -> bool:
 
 
 def plate(_answers: Given, found: Found, _subject: str) -> str | None:
-    """Return the rigid body whose name contains ``plate``; without a stream, return ``Plate``."""
+    """Return the rigid body whose name contains ``plate``, or None if the stream has no such body.
+
+    Without a stream, return ``Plate``.
+    """
     if not found.bodies and not found.markers:
         return "Plate"
     return next((body for body in found.bodies if "plate" in body.casefold()), None)

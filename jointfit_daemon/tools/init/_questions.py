@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.init._parsing import Kind
 
 Finder = Literal["movement", "traffic", "identifiers", "stream"]
-"""Search that the command ``find`` starts. The search identifies a sensor by its movement, a driver
-by the received data, the identifiers on a CAN bus, or the names in a motion-capture stream."""
+"""Search that the command ``find`` starts. The search finds a sensor by its movement, a driver by
+the received data, the identifiers on a CAN bus, or the names in a motion-capture stream."""
 
 Given = Mapping[Key, Any]
 Propose = Callable[[Given, Found, str], Any]

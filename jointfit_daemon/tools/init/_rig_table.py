@@ -123,7 +123,7 @@ def _imu(answers: Given, found: Found, buses: Mapping[str, str], name: str) -> d
 
 
 def _layout_stand_in(wiring: Wiring, at: int) -> dict[str, Any]:
-    """Return a placeholder layout for checks before the layout of sensor `at` is known."""
+    """Return a placeholder for the checks while the layout of sensor number `at` is unknown."""
     if wiring == "serial":
         return {"text": {}, "fields": {"quaternion": {"column": 1}}}
     quaternion = {"offset": 0, "type": "i16", "divisor": 32767}

@@ -23,7 +23,7 @@ def draw_refinement(path: Path, found: Refinement) -> None:
     left, right = figure.subplots(1, 2, width_ratios=(2, 1))
     figure.suptitle(f"{found.model.name}: {found.method}")
 
-    # Residual before and after refinement, and displacement, by marker
+    # Draw the residual of each marker before and after the refinement, and its displacement.
     places = np.arange(len(found.markers))
     before = [MM_PER_M * m.rms_before for m in found.markers]
     after = [MM_PER_M * m.rms_after for m in found.markers]
@@ -38,7 +38,7 @@ def draw_refinement(path: Path, found: Refinement) -> None:
     left.grid(alpha=0.3)
     left.legend(fontsize=8)
 
-    # Tracking error before and after refinement, by trial
+    # Draw the tracking error of each trial before and after the refinement.
     places = np.arange(len(found.trials))
     right.barh(places - 0.2, [MM_PER_M * t.before.rms for t in found.trials], 0.4, color=_BEFORE)
     right.barh(places + 0.2, [MM_PER_M * t.after.rms for t in found.trials], 0.4, color=_AFTER)

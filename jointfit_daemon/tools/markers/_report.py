@@ -82,7 +82,7 @@ def _summary(found: Refinement) -> list[str]:
             )
 
     for trained, word in ((True, "training"), (False, "validation")):
-        # Largest RMS error of a trial, and largest error of a marker, m.
+        # Find the largest RMS error of a trial, and the largest error of a marker in a frame, m.
         errors = [t.after for t in found.trials if t.trained is trained]
         unknown = float("nan")
         rms_after, largest = (

@@ -92,7 +92,11 @@ def _draw(
     span: tuple[float, float],
     every: int,
 ) -> None:
-    """Draw points; `newest` is the index of the last column, counted since 1970."""
+    """Draw points; `newest` is the number of dot columns from UNIX time 0 to the last column.
+
+    `column_us` is the duration of a dot column, `span` the angles at the lower and upper edge. Only
+    one of `every` dot columns is drawn.
+    """
     low, high = span
 
     def dot(point: _Point) -> tuple[int, int]:
@@ -132,7 +136,10 @@ def _caption(
 
 
 def _difference(imu: list[_Point], optical: list[_Point]) -> float | None:
-    """Return the RMS difference between simultaneous angles of sensors and cameras, degrees."""
+    """Return the RMS difference between simultaneous angles of sensors and cameras, degrees.
+
+    The result is None with fewer than `_LEAST_PAIRS` simultaneous angles.
+    """
     squares, at = [], 0
     for t_us, value in imu:
         while at + 1 < len(optical) and abs(optical[at + 1][0] - t_us) <= abs(

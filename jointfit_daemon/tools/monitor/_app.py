@@ -124,7 +124,7 @@ class MonitorApp(App[int]):
             self.act(action)
 
     def on_key(self, event: Key) -> None:
-        """Cancel the input of a mark; this method receives no other keys."""
+        """Cancel the input of a mark at the Escape key; ignore other keys."""
         if event.key == "escape":
             self._close_mark()
 

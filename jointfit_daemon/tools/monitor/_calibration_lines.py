@@ -148,7 +148,7 @@ def _result(calibration: CalibrationState, width: int) -> list[Line]:
         TypeError,
         ValueError,
         AttributeError,
-    ):  # format of another version
+    ):  # the quality has the format of another version
         texts = [
             "The quality of this calibration cannot be read: its format is of another version."
         ]

@@ -197,7 +197,7 @@ def _ms(microseconds: float | None) -> float | None:
 
 
 def _latency_text(latency: Latency) -> str:
-    """Return the latency of frames as text: total, and the 99th percentile by stage."""
+    """Return the latency of frames as text: of all stages together, and the p99 of each stage."""
     total = latency.total_us
     if total is None:
         return "frames: none written since the last health message"

@@ -23,8 +23,8 @@ _BRANCHED_TURN_DEG = 35.0
 """Angle between the direction of view and the lateral direction for a limb with two sides, degrees.
 In a lateral view, one side would hide the other."""
 _LEAST_HORIZONTAL = 0.1
-"""Smallest horizontal component of the unit vector ahead of the subject; shorter vectors are not
-used."""
+"""Smallest horizontal component of the unit vector ahead of the subject. A vector with a smaller
+horizontal component does not determine the direction."""
 _LONGEST_LABEL = 12
 """Maximum width of the name of a joint next to the figure, cells."""
 
@@ -36,10 +36,16 @@ def limb_lines(
 
     Parameters
     ----------
+    rig
+        Newest messages of the rig.
+    columns, rows
+        Size of the figure, cells.
     turn_deg
         Direction of view about the vertical, degrees from the subject's right side.
     optical
         Whether the newest pose from the cameras is also drawn, as a dotted figure.
+    unicode
+        Whether the terminal shows Braille patterns; if not, the figure has ASCII characters.
     """
     pose, info = rig.pose, rig.info
     if pose is None or info is None:

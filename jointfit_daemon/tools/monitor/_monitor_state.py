@@ -117,7 +117,7 @@ class MonitorState:
         self.link, self.reason = "lost", printable(reason)
 
     def set_found_rigs(self, rigs: Mapping[str, str]) -> str | None:
-        """Store the result of a search; return the base topic if there is only one rig."""
+        """Store the result of a search; return the base topic of the only rig, or None."""
         self.rigs = {base: printable(name) for base, name in sorted(rigs.items())}
         self.link, self.reason = "searching", ""
         return next(iter(self.rigs)) if len(self.rigs) == 1 else None
@@ -165,7 +165,7 @@ class MonitorState:
         return calibration is not None and calibration.phase in RUNNING
 
     def chosen_version(self) -> StoredVersion | None:
-        """Return the selected entry of the history."""
+        """Return the selected entry of the history; None if the history is empty or unknown."""
         if self.stored is None or not self.stored.versions:
             return None
         return self.stored.versions[min(self.cursor, len(self.stored.versions) - 1)]
@@ -184,7 +184,7 @@ class MonitorState:
                 return ChooseRig(bases[min(self.cursor, len(bases) - 1)])
             return None
 
-        # The keys select a view, then an entry within the view, then a request.
+        # First test the keys that select a view, then the keys of the view, then request keys.
         if key.isdecimal() and 1 <= int(key) <= len(VIEWS):
             self._show(VIEWS[int(key) - 1])
         elif key in {"tab", "shift+tab"}:
@@ -243,7 +243,10 @@ class MonitorState:
         return True
 
     def _record(self) -> Action | None:
-        """Return the request to start the recording, or at the second press to stop it."""
+        """Return the request that the key R causes, or None.
+
+        The key starts a recording at the first press, and stops a recording at the second press.
+        """
         recording, asked = recording_of(self.rig), self.asked_to_stop
         self.asked_to_stop = recording is not None and recording.active and not asked
         if recording is None or self.asked_to_stop:
@@ -251,7 +254,7 @@ class MonitorState:
         return SendRequest("record", {"action": "stop" if recording.active else "start"})
 
     def _requested_by(self, key: str) -> Action | None:
-        """Return the request of a key; some keys work in the calibration view only."""
+        """Return the action of a key, or None; some keys work in the calibration view only."""
         if key == "m":
             return AskMark()
         if key == "R":

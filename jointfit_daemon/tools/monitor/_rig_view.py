@@ -85,8 +85,8 @@ class RigView:
     faults: dict[str, str] = field(default_factory=dict)
     """Reason why the last message of a topic could not be decoded."""
     reach_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    """Largest horizontal distance of a joint from the first joint, and the lowest and highest
-    position relative to the first joint, m."""
+    """Largest horizontal distance of a joint from the first joint, and the smallest and largest
+    height relative to the first joint, m."""
     clock_offset_us: float | None = None
     """UNIX time of the gateway minus monotonic time of this machine, µs; None if unknown."""
     clock_error_us: float = 0.0
@@ -152,7 +152,7 @@ class RigView:
                 pass
 
     def _take_pose(self, pose: Pose, now: Moment) -> None:
-        # A time before the previous time means that the daemon restarted or its clock was set. The
+        # If a pose is older than the previous pose, the daemon restarted or its clock was set. The
         # curve then restarts.
         if self.pose is not None and pose.t_us < self.pose.t_us:
             self.poses.clear()

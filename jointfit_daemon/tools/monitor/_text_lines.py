@@ -70,7 +70,7 @@ class Line:
         return Line((*spans, ("…" if width else "", "")))
 
     def to_ascii(self) -> Line:
-        """Return the line with ASCII characters only, of the same width or longer."""
+        """Return the line with ASCII characters only; the width remains equal or increases."""
         return Line(tuple((to_ascii(text), style) for text, style in self.spans))
 
 

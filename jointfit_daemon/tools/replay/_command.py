@@ -126,7 +126,7 @@ def _calibration(given: str, rig: Rig) -> Calibration:
     Raises
     ------
     ValueError
-        The version or the file does not exist, or it is damaged.
+        The version or the file does not exist or is damaged.
     """
     from jointfit_daemon.calibration.record import CalibrationFileError, CalibrationStore
     from jointfit_daemon.reprocessing import load_calibration

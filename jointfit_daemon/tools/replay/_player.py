@@ -74,7 +74,7 @@ async def play_recording(
     *,
     quiet: bool = False,
 ) -> PlaySummary:
-    """Process a recording with a new core at a given speed, and return a summary.
+    """Process a recording at a given speed as the daemon does, and return a summary.
 
     Parameters
     ----------

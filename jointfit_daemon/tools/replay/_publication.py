@@ -1,4 +1,4 @@
-"""Publication of a replay with the topics and payloads of the daemon, below its own base topic.
+"""Publication of a replay with the topics and payloads of the daemon, below another base topic.
 
 The payloads contain the time stamps of the recording. The topic ``bridge/health`` describes a
 running daemon, so it is not published. Invariant: requests to a replay are ignored, and all

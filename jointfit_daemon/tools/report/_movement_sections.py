@@ -108,7 +108,10 @@ def angles_section(results: SessionResults) -> str:
 
 
 def _detail_start(results: SessionResults) -> float | None:
-    """Return the start of the detailed section, s: the first walking or the largest movement."""
+    """Return the start of the detailed section, s: the first walking or the largest movement.
+
+    If the session is too short for a detailed section, return None.
+    """
     if results.end_s - results.start_s < 3.0 * _DETAIL_S:
         return None
     first = _first_cycle(results)

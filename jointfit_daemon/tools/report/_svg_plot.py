@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 WIDE, NARROW = 920.0, 343.0
-"""Widths of the two drawings of a chart, CSS pixels. Screens and paper show the first; phones show
-the second."""
+"""Widths of the two drawings of a chart, CSS pixels. Large screens and paper show the wide drawing;
+phones show the narrow drawing."""
 _TICK_STEPS = (1.0, 2.0, 5.0, 10.0)
 _TIME_STEPS_S = (
     0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 30.0, 60.0, 120.0, 300.0, 600.0, 900.0, 1800.0,
@@ -78,7 +78,7 @@ def responsive(draw: Callable[[float, str], str]) -> str:
 
 
 def nice_ticks(low: float, high: float, most: int) -> list[float]:
-    """Return at most about `most` round values from `low` to `high`."""
+    """Return at most `most` + 1 round values from `low` to `high`; [low] for an empty range."""
     span = high - low
     if not isfinite(span) or span <= 0.0:
         return [low]
@@ -105,7 +105,10 @@ def time_text(t_s: float, span_s: float) -> str:
 def pad_limits(
     low: float, high: float, share: float = 0.08, least: float = 1.0
 ) -> tuple[float, float]:
-    """Return the limits of an axis with a margin at both ends."""
+    """Return the limits of an axis with a margin at both ends.
+
+    The margin is `share` times the range of values, or larger if the range is less than `least`.
+    """
     if not (isfinite(low) and isfinite(high)):
         return 0.0, 1.0
     margin = max(share * (high - low), 0.5 * max(0.0, least - (high - low)), 1e-6)
@@ -211,7 +214,7 @@ def points(area: PlotArea, x: Array, y: Array, kind: str) -> str:
 
 
 def runs(known: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return the start and the end of every run of True."""
+    """Return the first index of every run of True, and the index after the run."""
     edges = np.flatnonzero(np.diff(np.concatenate(([0], known.astype(np.int8), [0]))))
     return [(int(start), int(end)) for start, end in edges.reshape(-1, 2)]
 

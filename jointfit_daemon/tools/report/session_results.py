@@ -58,7 +58,7 @@ class SessionResults:
         ]
 
     def optical_joint(self, name: str) -> JointSeries | None:
-        """Return the angles of a joint as measured by the cameras."""
+        """Return the angles of a joint as measured by the cameras; None without such angles."""
         return next((j for j in self.session.optical_joints if j.name == name), None)
 
     def values(self, kind: str) -> dict[str, Mapping[str, Any]]:

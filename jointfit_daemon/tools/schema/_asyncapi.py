@@ -43,8 +43,7 @@ def asyncapi_document() -> dict[str, Any]:
         title = schema["title"]
         schemas[title] = _move_references(schema, f"#/components/schemas/{title}")
 
-        # Convert a topic to a key of the document.
-
+        # The key of the channel is the topic pattern with underscores.
         channels[key := re.sub(r"[^A-Za-z0-9]", "_", pattern)] = _channel(topic, pattern, title)
         return key
 

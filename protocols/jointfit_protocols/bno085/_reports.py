@@ -151,7 +151,7 @@ def decode_report(report: bytes) -> HubReport | None:
 
 
 def decode_gyro_rotations(payload: bytes) -> list[tuple[float, ...]] | None:
-    """Return i j k real, and the angular rate, rad/s, of each gyro rotation vector of a packet.
+    """Return each gyro rotation vector of a packet: i j k real, and the angular rate x y z, rad/s.
 
     Return None if the vectors do not fill the packet.
     """
@@ -164,7 +164,7 @@ def decode_gyro_rotations(payload: bytes) -> list[tuple[float, ...]] | None:
 
 
 def encode_gyro_rotation(values: tuple[float, ...]) -> bytes:
-    """Return the bytes of i j k real and the angular rate. Values out of range are clipped."""
+    """Return the bytes of one gyro rotation vector. Values out of range are clipped."""
     counts = [round(v / s) for v, s in zip(values, _GYRO_ROTATION_SCALES, strict=True)]
     return _GYRO_ROTATION.pack(*(max(-32768, min(32767, count)) for count in counts))
 

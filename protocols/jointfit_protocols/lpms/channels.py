@@ -168,7 +168,7 @@ class LpmsCanCodec:
         self._places = (places[0], places[1], places[2], places[3])
         self._longest_ns = longest_ns
         self._values: tuple[float, ...] = ()
-        self._received = 0  # frames of the open quaternion
+        self._received = 0  # frames of the incomplete quaternion
         self._t_ns = 0
         self.messages = 0
         """Number of well-formed frames of this sensor."""

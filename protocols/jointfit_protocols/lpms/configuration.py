@@ -16,8 +16,8 @@ that reads a setting in one generation may write a setting in the other:
 | firmware              | 2F: patch, minor, major            | 15: text                         |
 | 5B                    | device name, text                  | filter mode, U4                  |
 
-The settings are lost at power-off unless they are stored, because the firmware of 2013 writes its
-registers to memory, not to flash.
+Settings are lost at power-off unless they are stored: according to the firmware source of 2013, a
+command changes only the memory, not the flash.
 
 Source: the vendor's register headers (OpenMAT), protocol pages and firmware source of 2013. The
 command 5B was not tested on hardware; both headers list it as a read command.
@@ -268,7 +268,7 @@ def sends_seconds(version: str) -> bool:
 
 
 def identify_generation(data: bytes) -> Generation | None:
-    """Return the generation that answers `LpmsCommand.IDENTIFY` with `data`; None if unclear."""
+    """Return the generation that replies with `data` to `LpmsCommand.IDENTIFY`; None if unknown."""
     if len(data) == _WORD.size and data[1:] == bytes(3):
         return 3
     text = data.rstrip(b"\0")

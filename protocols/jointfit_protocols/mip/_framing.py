@@ -2,7 +2,7 @@
 
      0    1    2         3    4 ..            4+n  5+n
     | 75 | 65 | desc.set | n | fields ...    | S1 | S2 |
-    field: | length, with itself and the descriptor | descriptor | data |
+    field: | length, including itself and the descriptor | descriptor | data |
 
 S1 is the sum of all bytes before the checksum, and S2 is the sum of all values of S1, both modulo
 256. The fields fill the n bytes exactly. Numbers are big-endian. Descriptor sets below 0x80 are
@@ -88,7 +88,7 @@ def split_fields(payload: bytes) -> tuple[MipField, ...] | None:
 def _read_packet(buffer: bytes, at: int, base: int) -> MipPacket | CorruptBytes | None:
     """Return the packet at `at`, the reason why there is none, or None if it is incomplete."""
     end = len(buffer)
-    if not buffer.startswith(SYNC, at):  # the last byte may be the first half of a start
+    if not buffer.startswith(SYNC, at):  # the last byte may be the first start byte
         return None if at == end - 1 and buffer[at] == SYNC[0] else _NO_START
 
     if end - at < _HEAD:

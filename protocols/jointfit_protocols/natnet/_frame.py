@@ -72,7 +72,7 @@ class Body(NamedTuple):
 class LabeledMarker(NamedTuple):
     """One labeled marker (26 bytes).
 
-    Its id is ``model << 16 | member``, with model 0 for no model.
+    Its id is ``model << 16 | member``. The model is 0 if the marker belongs to no model.
     """
 
     id: int

@@ -42,7 +42,7 @@ BODY_HEAD_LAYOUT = struct.Struct("<ii3f")
 NAMES_FROM: Version = (4, 0)
 """First bitstream whose body descriptions contain marker names."""
 
-_SMALLEST = 8  # type and size, or type and the shortest description
+_SMALLEST = 8  # bytes: type and size, or type and the shortest description
 
 
 class MarkerSetDescription(NamedTuple):

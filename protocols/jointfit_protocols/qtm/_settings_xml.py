@@ -97,7 +97,7 @@ def _body(body: ET.Element) -> QtmBody:
     points = body.find("Points")
     named = (
         body.findall("Point") if points is None else points.findall("Point")
-    )  # elements below version 1.21
+    )  # below version 1.21, points are elements of the body
     origins = {_text(body, "Data_origin"), _text(body, "Data_orientation")}
     return QtmBody(
         _cut(_text(body, "Name") or ""),

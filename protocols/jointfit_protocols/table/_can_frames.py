@@ -47,7 +47,7 @@ class Multiplexer(NamedTuple):
         return len(data) >= self.size and int.from_bytes(data, "little") & self.mask in self.values
 
     def __and__(self, other: Multiplexer) -> Multiplexer:
-        """Return the multiplexer of the data that match both."""
+        """Return the multiplexer of the data that match both multiplexers."""
         shared = self.mask & other.mask
         values = frozenset(
             one | another
@@ -58,7 +58,7 @@ class Multiplexer(NamedTuple):
         return Multiplexer(self.mask | other.mask, values)
 
     def excludes(self, other: Multiplexer) -> bool:
-        """Return whether no data match both."""
+        """Return whether no data match both multiplexers."""
         shared = self.mask & other.mask
         return {value & shared for value in self.values}.isdisjoint(
             value & shared for value in other.values
@@ -75,7 +75,7 @@ class CanTable(NamedTuple):
     longest_ns: int = 1_000_000_000
     """Longest time between the first and the last frame of a sample, ns."""
     names: tuple[str, ...] = ()
-    """Names of the frames, which are used in messages."""
+    """Names of the frames, for messages to the user."""
     multiplexers: Mapping[int, Multiplexer] = {}
     """Multiplexers of the frames that have one. The keys are indices of `keys`."""
 
@@ -113,7 +113,7 @@ class CanTableCodec:
             self._multiplexed.setdefault(table.keys[number], []).append((multiplexer, number))
         self._single = len(table.keys) == 1
         self._start_ns = 0
-        self._next = 0  # number of the frame that continues the open sample
+        self._next = 0  # number of the frame that continues the current sample
         self._datas: list[bytes] = [b""] * len(table.keys)
         self._values: list[float | None] = [None] * len(self.slots)
         self._complete = True  # whether no frame with measurements is missing
@@ -146,7 +146,7 @@ class CanTableCodec:
             return CanSample(t_ns, part.read(data, 0), (data,))
 
         if self._next and (number < self._next or t_ns - self._start_ns > self._table.longest_ns):
-            self._begin()  # the end of the open sample was lost
+            self._begin()  # the end of the current sample was lost
             self.incomplete += 1
         if not self._next:
             self._start_ns = t_ns
@@ -174,7 +174,7 @@ class CanTableCodec:
         )
 
     def _select(self, key: CanKey, data: bytes) -> int | None:
-        """Return the number of the multiplexed frame that has these data."""
+        """Return the number of the multiplexed frame that has these data; None if there is none."""
         pages = self._multiplexed.get(key, ())
         for multiplexer, number in pages:
             if multiplexer.matches(data):

@@ -99,7 +99,7 @@ def _compile_crc(checksum: Checksum) -> Callable[[bytes], int]:
         polynomial = _POLYNOMIALS[checksum.kind]
     if polynomial == _CCITT and not checksum.reflected and checksum.kind == "crc16":
         return lambda data: crc_hqx(data, init) ^ xor_out
-    if polynomial == _CRC32 and checksum.reflected:  # the library inverts before and after
+    if polynomial == _CRC32 and checksum.reflected:  # zlib inverts before and after
         start, inverted = _reflect(init, width) ^ 0xFFFFFFFF, xor_out ^ 0xFFFFFFFF
         return lambda data: crc32(data, start) ^ inverted
 

@@ -99,7 +99,7 @@ def parse_type(text: str) -> tuple[Kind, int] | None:
         return None
     kind: Kind = "u" if match["kind"] == "u" else "i" if match["kind"] == "i" else "f"
     bits = int(match["bits"])
-    least = 2 if kind == "i" else 1  # the sign and at least one digit
+    least = 2 if kind == "i" else 1  # the sign bit and at least one other bit
     possible = bits in _FLOATS if kind == "f" else least <= bits <= _MOST_BITS
     return (kind, bits) if possible else None
 

@@ -110,7 +110,7 @@ class FrameCodec(ResynchronizingCodec[TableMessage]):
         """Largest size of a frame, bytes."""
         return self._fixed or self._form.longest
 
-    def feed(self, data: bytes) -> list[TableItem]:  # type: ignore[explicit-override]  # Python 3.12's
+    def feed(self, data: bytes) -> list[TableItem]:  # type: ignore[explicit-override]  # typing.override needs Python 3.12
         """Return the frames that `data` completes, in wire order; never raise."""
         skipped = self.skipped
         found = super().feed(data)
@@ -118,7 +118,7 @@ class FrameCodec(ResynchronizingCodec[TableMessage]):
             return found
         return [item for item in found if not isinstance(item, TableMessage) or item.data]
 
-    def flush(self) -> list[TableItem]:  # type: ignore[explicit-override]  # Python 3.12's
+    def flush(self) -> list[TableItem]:  # type: ignore[explicit-override]  # typing.override needs Python 3.12
         """Discard an incomplete frame; return frames that the other pending bytes contain."""
         self._is_final = True
         found = self.feed(b"") + super().flush()

@@ -1,4 +1,6 @@
-"""Bodies of the objects of the Vicon DataStream, in both directions.
+"""Encoding and decoding of the objects of the Vicon DataStream.
+
+The *body* of an object consists of its bytes after the header.
 
 Invariant: a count or length is compared with the number of remaining bytes before anything is read.
 Time and memory are therefore proportional to the size of the body. Bytes after the known content of
@@ -63,8 +65,8 @@ OPTIONAL = frozenset((
     ObjectId.APPLICATION_INFO, ObjectId.FRAME_RATES, ObjectId.OBJECT_QUALITY, ObjectId.PING,
     ObjectId.SUBJECT_INFO,
 ))  # fmt: skip
-"""Objects that are not necessary to know poses or markers. Servers of other versions may send only
-a part of such an object."""
+"""Objects that are not needed for poses or markers. Servers of other versions may send only a part
+of such an object."""
 
 
 class _BodyError(Exception):

@@ -134,7 +134,7 @@ class VrpnCodec:
             if end - at < size:
                 self._needed = size
                 break
-            # This case is tested first, because poses are nearly the whole stream.
+            # This case is tested first, because nearly all messages are poses.
             if length == _POSE_BYTES and kinds.get(kind) is _Kind.POSE and micros < _US:
                 sensor, x, y, z, qx, qy, qz, qw = unpack_pose(buffer, at + HEADER_BYTES)
                 found.append(

@@ -12,7 +12,7 @@ all other types, and describes each number by a name.
 | -3 UDP channel | host and NUL; UDP port in `sender` |
 | -4 log description, -5 disconnect | |
 | ``vrpn_Tracker Pos_Quat`` | i32 sensor, i32, 3 f64 position, 4 f64 quaternion x y z w |
-| ``vrpn_Tracker Velocity``, ``Acceleration`` | the same, f64 interval of the quaternion, s |
+| ``vrpn_Tracker Velocity``, ``Acceleration`` | the same, then f64 interval of the quaternion, s |
 | ``vrpn_Base ping_message``, ``pong_message`` | empty |
 
 Source: VRPN 07.38, vrpn_Connection.C and vrpn_Tracker.C.

@@ -1,7 +1,7 @@
 """Commands that write and read the registers of WitMotion IMUs.
 
     FF AA register low high      write; accepted for 10 s after `UNLOCK`, never acknowledged
-    FF AA 27 register high       read; answered with a frame 0x5F, by older firmware not at all
+    FF AA 27 register high       read; answered with a frame 0x5F, but not by older firmware
 
 Written registers take effect at once. Only `SAVE` stores them in flash.
 

@@ -33,7 +33,7 @@ class Item(IntEnum):
 
     UTC_TIME = 0x1010
     PACKET_COUNTER = 0x1020
-    """U2 counter, which every MTData2 message increments; it wraps."""
+    """U2 counter, modulo 65536, which every MTData2 message increments."""
     SAMPLE_TIME_FINE = 0x1060
     """Time of the sample, U4, in ticks of 100 us."""
     SAMPLE_TIME_COARSE = 0x1070

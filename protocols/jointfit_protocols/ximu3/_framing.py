@@ -57,7 +57,7 @@ Found = XImu3Data | XImu3Reply | CorruptBytes
 class XImu3Codec:
     """Codec that converts byte strings of any size to messages.
 
-    A line without a message becomes one `CorruptBytes`. A line that is too long becomes several.
+    A line without a message becomes one `CorruptBytes`, or several if the line is too long.
     """
 
     def __init__(self) -> None:

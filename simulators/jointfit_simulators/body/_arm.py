@@ -1,9 +1,10 @@
 """A right arm on the thorax: bones, markers and movements.
 
-The angles of the shoulder are tilt and torsion. The first two columns are the rotation vector of
-the long axis (positive forward and towards the midline). The third column is the internal rotation.
-These angles have no singularity below 180 degrees of elevation. Elbow and wrist have the angles of
-the leg: flexion forward, adduction, and internal rotation, which is pronation.
+The angles of the shoulder describe the tilt and the torsion of the upper arm. The first two columns
+are the rotation vector of the tilt, positive forward and towards the midline. The third column is
+the torsion, positive for internal rotation. These angles have no singularity below 180 degrees of
+elevation. Elbow and wrist have the angles of the leg: flexion forward, adduction, and internal
+rotation, which is pronation.
 
 Invariant: a motion has two continuous derivatives.
 """

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from jointfit_simulators.body._limb import LegGeometry
 
 LOCKED = ("P1", "P2")
-"""Markers that the refinement may not move."""
+"""Markers whose positions the simultaneous refinement may not change."""
 MISPLACED_M = 0.006
 """Standard deviation of each coordinate of a misplaced marker, m."""
 _EXACT_PARTS = ("pelvis",)

@@ -59,8 +59,8 @@ _GEOMETRY = LegGeometry()
 _MIRROR = np.array([-1.0, 1.0, 1.0])
 """Factors of a reflection about the sagittal plane."""
 _LATER_S = 550.0
-"""Delay of the left leg's variability, s. It is a multiple of the stride (1.1 s), and long enough
-for independent values."""
+"""Delay of the left leg's variability, s. It is a multiple of the stride (1.1 s), and so long
+that the variability of both legs is independent."""
 _HALF_STRIDE_S = 0.55
 _PARTS = ("thigh", "shank", "foot")
 _CLUSTERS = {
@@ -168,7 +168,7 @@ MOTIONS: Mapping[str, StyledMotion] = {
 def _templates(random: np.random.Generator) -> dict[str, Array]:
     """Return marker positions in the frame of each part, m; the left side is mirrored."""
     right = marker_templates(random, _GEOMETRY)
-    left = marker_templates(random, _GEOMETRY)  # has its own placement errors
+    left = marker_templates(random, _GEOMETRY)  # with other placement errors
     found = {"pelvis": right["pelvis"]} | {f"right_{part}": right[part] for part in _PARTS}
     return found | {f"left_{part}": left[part] * _MIRROR for part in _PARTS}
 

@@ -1,8 +1,8 @@
 """Description of a limb that the simulator can move.
 
 A limb is a chain of at most four body parts, or two legs with the pelvis. Its posture has the
-columns of ``_limb.py``: position and orientation of the base, the angles of the joints, and the
-plate. The base is the pelvis, or the thorax for an arm. Each of the three joints (per leg) has
+columns of ``_limb.py``: pose of the base, angles of the joints, and pose of the calibration plate.
+The base is the pelvis, or the thorax for an arm. Each of the three joints (per leg) has
 three angles.
 
 The *base world* is the world in which the movement of the subject is described, with z up.

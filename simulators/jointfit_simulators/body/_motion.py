@@ -110,7 +110,10 @@ def walk(style: MovementStyle, t: Array) -> Array:
 
 
 def _sagittal(style: MovementStyle, t: Array, *, knee: Array, thigh: Array, lean: Array) -> Array:
-    """Flex hip, knee and ankle over a flat foot; `thigh` and `lean` are pitch angles in space."""
+    """Flex hip, knee and ankle over a flat foot.
+
+    All angles are in rad. `thigh` and `lean` are pitch angles in space.
+    """
     coordinates = upright_pose(style, t)
     coordinates[:, column(PELVIS_TURN, TILT)] = -lean
     coordinates[:, column(HIP, FLEXION)] = thigh + lean

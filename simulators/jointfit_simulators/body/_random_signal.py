@@ -22,9 +22,10 @@ class RandomSignal:
 
     .. math:: x_c(t) = \sum_k a_{ck}\cos 2\pi f_k t + b_{ck}\sin 2\pi f_k t
 
-    This is Rice's sum of sinusoids (Bell Syst. Tech. J. 23, 1944). The :math:`f_k` are stratified
-    over the band. The amplitudes are scaled so that every channel has exactly its RMS over a time
-    much longer than ``1/low_hz``.
+    This is Rice's sum of sinusoids for each channel *c* (Bell Syst. Tech. J. 23, 1944). The band is
+    divided into equal parts, and each frequency :math:`f_k` is random within its part. The
+    amplitudes :math:`a_{ck}` and :math:`b_{ck}` are random, and scaled so that every channel has
+    exactly its RMS over a time much longer than ``1/low_hz``.
 
     Parameters
     ----------

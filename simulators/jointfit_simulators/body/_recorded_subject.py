@@ -135,7 +135,7 @@ class RecordedSubject:
     def _recorded_clusters(
         self, clusters: Mapping[str, tuple[str, ...]]
     ) -> Mapping[str, tuple[str, ...]]:
-        """Return the recorded marker clusters and the other markers; set all column indices."""
+        """Return the recorded markers by part; store the index of each in the recording."""
         markers = self._recording.markers
         recorded = markers.names if markers else ()
         known = {part: names for part, names in clusters.items() if set(names) <= set(recorded)}

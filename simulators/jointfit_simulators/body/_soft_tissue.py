@@ -76,10 +76,11 @@ class SoftTissue:
 
     .. math:: d(t) = \sum_j \Phi(\theta_j) C_j + g(\theta)\,n(t)
 
-    Here :math:`\Phi = (\sin f, 1-\cos f, \tfrac12\sin 2f, \sin a, \sin i)` are the features of each
-    adjacent joint *j*, and :math:`C_j` is random. *n* is band-limited noise (0.3 to 3 Hz), and *g*
-    is the magnitude of :math:`\Phi`. The sum is scaled so that its RMS length over all vectors and
-    the `reference` is `rms`.
+    Each adjacent joint *j* has the angles :math:`\theta_j = (f, a, i)`: flexion, adduction and
+    internal rotation. Its features are
+    :math:`\Phi = (\sin f, 1-\cos f, \tfrac12\sin 2f, \sin a, \sin i)`. The matrix :math:`C_j` is
+    random. *n* is band-limited noise (0.3 to 3 Hz), and *g* is the magnitude of :math:`\Phi`. The
+    sum is scaled so that its RMS length over all vectors and the `reference` is `rms`.
 
     Parameters
     ----------

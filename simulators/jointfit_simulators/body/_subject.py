@@ -38,7 +38,7 @@ class Observation(NamedTuple):
     """Orientation q_base_sensor of each sensor, with alignment and soft-tissue artefact, shape (n,
     4)."""
     markers: Array
-    """Marker positions on the skin, m, shape (m, markers, 3); NaN if not recorded."""
+    """Marker positions on the skin, m, shape (camera times, markers, 3); NaN if not recorded."""
     bones: Mapping[str, tuple[Rotation, Array]]
     """Orientation and origin (m) of each bone that the cameras stream as a rigid body."""
     truth: GroundTruth

@@ -85,7 +85,7 @@ class Cameras:
         """Whether all markers are occluded."""
         self._absent: set[str] = set()
         self._labels = list(range(len(self.markers)))
-        """Index of the marker whose position each label has."""
+        """For each label, the index of the marker to which the label is assigned."""
 
     def hide(self, marker: str) -> None:
         """Occlude one marker."""

@@ -102,7 +102,7 @@ class SerialDevice(ABC):
 
     def _write(self, wire: bytes) -> bool:
         """Send bytes to the host; return whether all bytes were sent."""
-        if not self._same_speed:  # send as many invalid bytes
+        if not self._same_speed:  # replace each byte by an invalid one
             wire = bytes((byte * 7 + 1) & self.garbage_bits for byte in wire)
         return self._line.write(self._noise(wire))
 

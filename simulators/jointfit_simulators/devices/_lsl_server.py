@@ -1,6 +1,6 @@
 """Simulated program that sends motion capture to the Lab Streaming Layer (LSL) with liblsl.
 
-Invariant: coordinates of an occluded marker or body are NaN, or `LslServerOptions.absent`.
+Invariant: coordinates of an occluded marker or body have the value `LslServerOptions.absent`.
 The stamp of a sample is its exposure time on the clock of LSL, plus the clock difference of the
 simulated sender.
 """
@@ -42,11 +42,11 @@ class LslServerOptions:
     up_axis: Axis = "y"
     unit: Literal["m", "cm", "mm"] = "m"
     description: Literal["mocap", "labels", "none"] = "mocap"
-    """Description of the channels: ``mocap`` has marker, object, type and unit, and ``labels`` has
-    labels alone."""
+    """Description of the channels: marker, object, type and unit (``mocap``), only labels
+    (``labels``), or no description (``none``)."""
     channel_format: Literal["float32", "double64", "string"] = "double64"
     absent: float = math.nan
-    """Value in every channel of an occluded marker or body."""
+    """Value in every channel of an occluded marker or body; the default is NaN."""
     device_ns: Callable[[int], int] = same_clock
     """Conversion from host CLOCK_MONOTONIC to the clock of the stamps, both in ns."""
 

@@ -322,7 +322,7 @@ class MipDevice(SerialDevice):
         return self._output_reply(command, data)
 
     def _output_reply(self, command: int, data: bytes) -> tuple[int, tuple[MipField, ...]]:
-        """Return the reply to a command about base rate or message format."""
+        """Return code and fields of the reply to a command about base rate or message format."""
         for data_set in self._base_rates:
             stream = commands.stream_commands(self._options.family, data_set)
             if command == stream.base_rate and data == stream.prefix:

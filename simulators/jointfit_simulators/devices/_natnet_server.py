@@ -156,7 +156,7 @@ class NatNetServer:
         self._model_changed = _ANNOUNCED_FRAMES
 
     def set_bitstream(self, version: Version) -> None:
-        """Change the bitstream of all clients; the next frames announce the change."""
+        """Change the bitstream version of all clients; the next frames announce the change."""
         for client in (*self.clients, self._group):
             client.version, client.changed = version, _ANNOUNCED_FRAMES
 
@@ -317,7 +317,7 @@ class NatNetServer:
 
 
 def _selectable_version(text: str) -> Version | None:
-    """Return the version in a text ``MAJOR.MINOR`` if clients can select this version."""
+    """Return the version in a text ``MAJOR.MINOR`` if clients can select it, else None."""
     major, _, minor = text.partition(".")
     if not (major.isdecimal() and minor.isdecimal()):
         return None

@@ -25,9 +25,10 @@ class OrientationSensor:
 
     .. math:: \hat q(t) = e(t)\; q_{W_s W}\; q(t)\; n(t)
 
-    Here :math:`W_s` is the sensor's own world, which differs from the base world by a heading, and
-    with a simulated fault also by an inclination. The slow error *e* is on the world side, as in
-    fusion filters, and *n* is white noise.
+    Here *q* is the true orientation in the base world *W*. :math:`W_s` is the sensor's own world,
+    which differs from the base world by a heading, and with a simulated fault also by an
+    inclination. The slow error *e* is on the world side, as in fusion filters, and *n* is white
+    noise.
 
     Parameters
     ----------

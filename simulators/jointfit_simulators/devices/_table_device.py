@@ -233,7 +233,7 @@ class TableDevice:
 
     @property
     def streaming(self) -> bool:
-        """Whether the device sends: always on a serial line, with an open bus on CAN."""
+        """Whether the device sends. On a serial line it always sends, on CAN if the bus is open."""
         return self._port.is_open
 
     @property

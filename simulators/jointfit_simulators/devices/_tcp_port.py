@@ -48,7 +48,7 @@ class TcpClient:
             sent = self.socket.send(self._unsent)
             del self._unsent[:sent]
 
-        # No further frame might trigger the rest of this frame, so the event loop sends the rest.
+        # The event loop sends the rest of this frame, because there may be no further frame.
         with contextlib.suppress(RuntimeError, ValueError, OSError):  # no event loop, or closed
             loop = asyncio.get_running_loop()
             loop.remove_writer(self.socket)

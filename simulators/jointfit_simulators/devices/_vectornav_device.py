@@ -1,7 +1,8 @@
 """Virtual VectorNav device with binary outputs and ASCII registers on a pseudo-terminal (pty).
 
-Invariants: registers are volatile until they are stored. A reply repeats the request, and an error
-replaces a reply. ASCII messages are sent between binary outputs. Asynchronous output can be paused.
+Invariants: registers are volatile until they are stored. The reply to a valid request repeats the
+request, and the reply to an invalid request is an error message. ASCII messages are sent between
+binary outputs. Asynchronous output can be paused.
 """
 
 from __future__ import annotations

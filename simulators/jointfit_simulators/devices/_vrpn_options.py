@@ -38,7 +38,7 @@ class VrpnServerOptions:
     """Time between successive messages of one frame, µs."""
     described_late: bool = False
     """Whether the description of a tracker is sent immediately before its first pose. Otherwise, it
-    is sent after connection."""
+    is sent when a client connects."""
     answers_ping: bool = True
     velocities: bool = False
     """Whether a velocity follows every pose."""

@@ -1,7 +1,7 @@
 """Simulated VRPN server with trackers over TCP and UDP, in classic and direct connections.
 
-Invariant: the server sends no message for a body that is not visible. Time stamps are from the
-server's wall clock when a message is created, and this clock can step. The numbers of types and
+Invariants: the server sends no message for a body that is not visible. The time stamp of a message
+is the time of its creation on the server's wall clock, which can step. The numbers of types and
 senders differ from the numbers in clients.
 """
 
@@ -42,7 +42,8 @@ if TYPE_CHECKING:
     from jointfit_simulators.devices._natnet_port import Address
 
 _FIRST_SENDER, _FIRST_TYPE = 3, 11
-"""First numbers of trackers and types. In real servers, the connection uses the smaller numbers."""
+"""First numbers of trackers and types. In real servers, the connection itself uses the smaller
+numbers."""
 _CONTROL = "VRPN Control"
 _MOST_DATAGRAM = 1472
 _I32_MAX = b"\x7f\xff\xff\xff"
@@ -93,7 +94,7 @@ class VrpnServer:
         self.number = 0
         self.stepped_ns = 0
         self._sent_before = 0
-        self._made_ns = 0  # host time after the last message
+        self._made_ns = 0  # earliest host time of the next message
 
     @property
     def clients(self) -> int:

@@ -231,7 +231,7 @@ class XbusDevice(SerialDevice):
             self._timer.cancel()
 
     def _reply_of_age(self, mid: int, data: bytes) -> tuple[int, bytes] | None:
-        """Return the answer of an older or a newer device; their sets of requests differ."""
+        """Return `_reply`, or an error for a request that this age of device does not know."""
         options = self._options
         if options.legacy is None:
             unknown = mid in {XbusMessageId.OUTPUT_MODE, XbusMessageId.OUTPUT_SETTINGS}
@@ -243,12 +243,12 @@ class XbusDevice(SerialDevice):
         return (XbusMessageId.ERROR, _INVALID) if unknown else self._reply(mid, data)
 
     def _reply(self, mid: int, data: bytes) -> tuple[int, bytes] | None:
-        """Return identifier and data of the answer in configuration mode."""
+        """Return identifier and data of the answer in configuration mode; None for no answer."""
         options = self._options
         reply: tuple[int, bytes] | None = None
         match mid:
             case XbusMessageId.GOTO_MEASUREMENT:
-                self._send(XbusMessageId.CONFIGURATION, bytes(118))  # some devices send it first
+                self._send(XbusMessageId.CONFIGURATION, bytes(118))  # as some devices do
                 self.streaming = True
                 reply = XbusMessageId.GOTO_MEASUREMENT_ACK, b""
             case XbusMessageId.REQ_DEVICE_ID:

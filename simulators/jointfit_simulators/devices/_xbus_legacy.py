@@ -57,7 +57,7 @@ def legacy_content(
 def legacy_reply(
     layout: MTDataLayout, rate_hz: float, skip: int, mid: int
 ) -> tuple[int, bytes] | None:
-    """Return the answer to a request about MTData; None for other requests."""
+    """Return identifier and data of the answer to a request about MTData, else None."""
     replies: dict[int, bytes] = {
         XbusMessageId.OUTPUT_MODE: struct.pack(">H", layout.mode),
         XbusMessageId.OUTPUT_SETTINGS: struct.pack(">I", layout.settings),

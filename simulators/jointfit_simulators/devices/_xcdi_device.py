@@ -1,5 +1,7 @@
 """Virtual Xsens MTi-600 on a shared CAN bus: sends XCDI messages, and simulates faults on request.
 
+A group is the set of messages of one sample.
+
 Invariant: clock and group counter continue while the host does not receive.
 """
 

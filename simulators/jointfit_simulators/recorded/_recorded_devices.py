@@ -61,7 +61,7 @@ class RecordedXbusDevice(XbusDevice):
             for answer in answers:
                 options = _with_settings(options, answer)
             measurements = data
-            if answers:  # handshake: keep its measurements only
+            if answers:  # the chunk is part of the handshake
                 measurements = b"".join(
                     encode_xbus(one.mid, one.data, one.bid)
                     for one in messages

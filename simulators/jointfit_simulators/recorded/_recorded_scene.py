@@ -135,7 +135,7 @@ class RecordedScene:
         order = sorted(
             (t_ns, name, data) for name, device in active.items() for t_ns, data in device.chunks
         )
-        first_ns = order[0][0]  # the handshake, which is omitted, was earlier
+        first_ns = order[0][0]  # the first chunk after the omitted handshake
         report({"playing": round((order[-1][0] - first_ns) / NS_PER_S, 3)})
         for t_ns, name, data in order:
             due_ns = begin_ns + t_ns - first_ns

@@ -100,7 +100,7 @@ def natnet_pcap(
         (0, encode_natnet(model_definition(bodies, _BITSTREAM), _BITSTREAM)),
     ]
     for number, (exposure_ns, markers, poses) in enumerate(frames):
-        ticks = _CLOCK_HZ + exposure_ns * _CLOCK_HZ // NS_PER_S  # 0 means unknown
+        ticks = _CLOCK_HZ + exposure_ns * _CLOCK_HZ // NS_PER_S  # a stamp of 0 means unknown
         received, transmitted = ticks + _CLOCK_HZ // 200, ticks + _CLOCK_HZ // 150
         stamps = FrameStamps(number, number / rate_hz, ticks, received, transmitted, 0)
         frame = builder.frame(stamps, markers, poses)

@@ -192,8 +192,8 @@ def _lsl_markers(place: CameraPlace) -> tuple[LslServer, list[str]]:
             markers=tuple(name for names in place.clusters.values() for name in names),
             bodies=tuple(place.bodies),
             rate_hz=place.knobs.mocap_hz,
-            # liblsl sends its own clock, which the scene cannot change, so the stamps are on this
-            # clock.
+            # The stamps have the default clock, because clients receive the time of liblsl, which
+            # the scene cannot change.
         )
     )
     lines = [f'source_id = "{server.source_id}"', f'up_axis = "{server.options.up_axis}"']

@@ -1,9 +1,9 @@
 """Detects the first opening of a simulated serial port by a host.
 
 Without a reader, the bytes of a real serial device are lost. A pseudo-terminal (pty) stores them
-for the first reader, which discards an unknown part of them. A device that sends without a request
-therefore begins when its port has been opened, like a board that restarts when the host sets DTR.
-Every sample that counts as sent then reaches the reader.
+for the first reader, which discards an unknown part of them. A simulated device that sends without
+a request therefore begins when its port has been opened, like a board that restarts when the host
+sets DTR. Every sample that counts as sent then reaches the reader.
 """
 
 from __future__ import annotations

@@ -77,7 +77,7 @@ class PlayDirectory:
 
 @contextmanager
 def play_directory(path: Path) -> Iterator[PlayDirectory]:
-    """Create the directory, and lock it during the ``with`` block.
+    """Create the directory, and yield it locked during the ``with`` block.
 
     Raises
     ------

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from jointfit_simulators.body import RigChain
 
 _SHORTEST_S = 45.0
-"""Default of ``functional_min_s`` in the daemon, s. It is lowered to the duration of the phase."""
+"""Default of ``functional_min_s`` in the daemon, s. If the functional phase is shorter, rig.toml
+contains the duration of the phase instead."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -411,7 +411,7 @@ def _check_families(options: SceneOptions, sensors: Mapping[str, str]) -> None:
 def _create_cameras(
     options: SceneOptions, place: CameraPlace
 ) -> tuple[MocapServer | None, list[str]]:
-    """Return the motion-capture server and the lines of its table in rig.toml."""
+    """Return the motion-capture server, if there is one, and the lines of its table in rig.toml."""
     if options.mocap is None:
         return None, []
     family = MOCAP_FAMILIES[options.mocap]

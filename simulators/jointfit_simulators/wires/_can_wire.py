@@ -95,7 +95,7 @@ class SlcanAdapter:
         """Bit rate that the host has set, bit/s."""
 
     def send(self, frames: Iterable[CanFrame]) -> bool:
-        """Send all `frames` to the host or none of them."""
+        """Send all `frames` to the host or none; return whether they were sent."""
         if not self.is_open or self._bus_bitrate not in {None, self.bitrate}:
             return False
         stamp = time.monotonic_ns() // NS_PER_MS if self._stamping else None

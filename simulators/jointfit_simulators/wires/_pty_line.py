@@ -94,8 +94,7 @@ class PtyLine:
             with suppress(BlockingIOError):
                 self._rest = self._rest[os.write(self._fds[0], self._rest) :]
 
-            # No further write might trigger the rest of this message, so the event loop writes the
-            # rest.
+            # The event loop writes the rest of this message, because there may be no further write.
             if self._loop is not None:
                 self._loop.remove_writer(self._fds[0])
                 if self._rest:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _INTERVAL_S = 0.02
 _IDLE_S = 0.3
 """If no byte is unread for this time, the hosts have read all bytes, s. The kernel delivers bytes
-in blocks of 4 KB."""
+in blocks of 4 KB, and between two blocks the number of unread bytes can be 0."""
 _STALLED_S = 2.0
 """If the number of unread bytes does not change for this time, no host reads, s."""
 _MOST_S = 6.0

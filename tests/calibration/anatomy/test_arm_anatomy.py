@@ -1,4 +1,4 @@
-"""Segment frames of an arm from markers, for movements of the shoulder in any direction."""
+"""Segment frames of an arm from markers, for shoulder movements in several directions."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ STAND_S, MOVE_S, HZ = 3.0, 8.0, 20.0
 
 
 def anatomy(*motions: str, stiff: bool = False) -> Anatomy:
-    """Return the anatomy of a subject without soft-tissue artefact after some motions.
+    """Return the anatomy from the given motions of a subject without soft-tissue artefact.
 
-    The forearm and hand of a stiff arm turn with the upper arm.
+    If `stiff`, forearm and hand rotate with the upper arm.
     """
     steps = [Step("stand", STAND_S + 2.0), *(Step(name, MOVE_S) for name in motions)]
     subject = SimulatedSubject(perfect(Knobs()), steps, limb="arm")
@@ -55,7 +55,7 @@ def anatomy(*motions: str, stiff: bool = False) -> Anatomy:
 @pytest.mark.parametrize("raising", ["arm_swings", "abduction", "reach"])
 def test_the_frames_of_an_arm_do_not_depend_on_the_direction_of_the_shoulder(raising: str) -> None:
     found = anatomy(raising, "elbow_flexion", "wrist_circles")
-    for segment in CHAIN.segments:  # every frame of an upright subject equals the world
+    for segment in CHAIN.segments:  # all segment axes of an upright subject equal the world axes
         turn = Rotation.from_quat(found.q_static[segment], scalar_first=True)
         assert np.degrees(turn.magnitude()) < 6.0, segment
     assert not [flag for flag in found.flags if flag.startswith("axis_from_shoulder")]

@@ -1,4 +1,4 @@
-"""Joint centers by the estimators that rig.toml can name, against the geometry of the limb."""
+"""Joint centers by the estimators that rig.toml can select, compared with the true geometry."""
 
 from __future__ import annotations
 
@@ -90,7 +90,8 @@ def test_three_frames_of_a_live_track_weight_their_noise_by_the_residuals_of_the
     relative = rotation.multiply(rotation.conjugate(tracks["thigh"].q), shank.q)
     angle = 2.0 * np.arccos(np.clip(np.abs(relative[:, 0]), 0.0, 1.0))
     part = (angle - np.nanmin(angle)) / np.ptp(angle[np.isfinite(angle)])
-    used = np.abs(part[:, None] - [0.0, 0.5, 1.0]).min(axis=1) < 0.1  # first, middle and last
+    # These frames are close to the first, the middle or the last position.
+    used = np.abs(part[:, None] - [0.0, 0.5, 1.0]).min(axis=1) < 0.1
     used = np.tile(used[:, None], shank.points.shape[1])
 
     def predicted_variance(residuals: Array | None) -> float:
@@ -103,7 +104,7 @@ def test_three_frames_of_a_live_track_weight_their_noise_by_the_residuals_of_the
     plain = predicted_variance(None)
     assert predicted_variance(np.full_like(shank.points[..., 0], 3e-4)) == pytest.approx(plain)
     assert predicted_variance(np.where(used, 2e-4, 6e-4)) < 0.8 * plain
-    # the four markers disagree, so small residuals cannot reduce the variance
+    # the centers of the four markers differ, so small residuals do not reduce the variance
     assert predicted_variance(np.where(used, 6e-4, 2e-4)) > 0.99 * plain
 
 

@@ -1,4 +1,4 @@
-"""Hips, knees and ankles of both legs, and the frame of the shared pelvis, from markers."""
+"""Joint centers of both legs, and the axes of the shared pelvis, from markers."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_the_pelvis_begins_between_the_hips_and_points_from_left_to_right() -> N
     assert origin.source_text == "midpoint"
     middle = (truth["right_hip"] + truth["left_hip"]) / 2
     assert np.linalg.norm(origin.center - middle) < 3e-3
-    for segment in LEGS.segments:  # every frame of an upright subject equals the world
+    for segment in LEGS.segments:  # all segment axes of an upright subject equal the world axes
         turn = Rotation.from_quat(anatomy.q_static[segment], scalar_first=True)
         assert np.degrees(turn.magnitude()) < 3.0, segment
 

@@ -1,4 +1,4 @@
-"""Rigid fits of marker clusters: three visible markers suffice unless they are on a line."""
+"""Rigid fits of marker clusters: three visible markers that are not on a line are sufficient."""
 
 from __future__ import annotations
 
@@ -183,6 +183,6 @@ def test_an_intermittent_marker_causes_no_jump_in_spite_of_soft_tissue() -> None
     q_plain, _, _ = rigid_fit(TEMPLATE, gappy)
     q, p, _ = steady_fit(TEMPLATE, gappy)
     plain = (q_plain - q_whole)[np.isnan(gappy).any(axis=(1, 2))]
-    assert np.abs(plain).max() > 5e-3  # the jump of a plain fit
+    assert np.abs(plain).max() > 5e-3  # a fit without interpolation jumps
     assert np.abs(q - q_whole).max() < 1e-5
     assert np.abs(p - p_whole).max() < 1e-5

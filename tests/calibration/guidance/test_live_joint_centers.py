@@ -1,4 +1,4 @@
-"""Joint centers frame by frame: accuracy, predicted error, and no NaN."""
+"""Joint centers frame by frame: true error, predicted error, and absence of NaN."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def test_a_marker_that_moved_since_the_static_pose_is_named() -> None:
 
 def test_occasional_jumps_of_a_marker_do_not_affect_live_centers() -> None:
     static, track = trials()
-    part = slice(0, 15 * 120)  # five seconds of each movement
+    part = slice(0, 15 * 120)  # contains five seconds of each of the three movements
     track = replace(
         track,
         t_ns=track.t_ns[part],
@@ -191,7 +191,7 @@ def test_sideways_movement_is_requested_of_a_hip_that_moves_about_one_axis() -> 
     assert "no circumduction" in str(look.joints["hip"]["unseen"])
     assert "sideways" in str(look.joints["hip"]["unseen"])
 
-    # an estimator of one axis would refuse a movement sideways
+    # an estimator for one axis does not need a sideways movement, and would refuse it
     one_axis = replace(SETTINGS, joint_center_methods={"hip": "three_frames"})
     look = watched(static, track, track.positions, one_axis)
     assert "sideways" not in str(look.missing)

@@ -1,4 +1,4 @@
-"""The text on the missing movement of a joint: random error of its center, and target."""
+"""The text on a missing movement contains the random error of the joint center and the target."""
 
 from __future__ import annotations
 

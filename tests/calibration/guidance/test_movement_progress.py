@@ -1,4 +1,4 @@
-"""Progress of a functional movement: observed arcs, also after the loss of a sensor."""
+"""Progress of a functional movement: arcs and flexions, including the loss of a sensor."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ def test_a_sensor_that_takes_over_for_a_lost_one_adds_no_arc() -> None:
     progress = MovementProgress(CHAIN)
     progress.update({"S1": UPRIGHT, "S2": about_x(90), "S3": UPRIGHT})
     progress.update({"S1": UPRIGHT, "S2": about_x(90), "S3": about_x(10)})
-    progress.update({"S2": about_x(90), "S3": about_x(10)})  # another mount, and no movement
+    # S2 replaces S1, which has another mount. The joint does not move.
+    progress.update({"S2": about_x(90), "S3": about_x(10)})
     assert math.degrees(progress.arcs()["knee"]) == pytest.approx(10.0)
 
 
@@ -67,6 +68,6 @@ def test_a_chain_of_any_length_has_its_inner_joints(segments: int) -> None:
 def test_bends_are_counted_from_the_static_pose_wherever_the_movement_begins() -> None:
     progress = MovementProgress(CHAIN, {"S1": UPRIGHT, "S3": UPRIGHT})
     for _ in range(4):
-        for degrees in (60, 20, 40, 5):  # 20 is not straight: 60, 20, 40 is one bend
+        for degrees in (60, 20, 40, 5):  # at 20° the joint is not extended, so this is one flexion
             progress.update({"S1": UPRIGHT, "S3": about_x(degrees)})
     assert progress.bends() == {"knee": 4}

@@ -1,4 +1,4 @@
-"""A simulated sensor with known errors, moved by a script: rest, static poses, free rotation."""
+"""A simulated sensor with known errors: readings at rest, in static poses, in free rotation."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RATE_HZ = 50
 STEP_NS = 1_000_000_000 // RATE_HZ
 GRAVITY = 9.80665
 MOVE_S = 0.5
-"""Time of a turn between two poses, s."""
+"""Duration of a turn between two poses, s."""
 FIELD = 48.0
 """Magnitude of the magnetic field, uT."""
 
@@ -56,7 +56,11 @@ class FaultySensor:
     def readings(
         self, up: Array, north: Array, rates: Array, seed: int | np.random.Generator = 0
     ) -> list[SensorReading]:
-        """Return readings; up and north are unit vectors of gravity and field in sensor axes."""
+        """Return readings at `RATE_HZ` for the true vertical, field direction and angular rates.
+
+        `up` and `north` are unit vectors along the vertical and the field, in sensor axes. `rates`
+        are in rad/s.
+        """
         rng = np.random.default_rng(seed)
         gyr, acc, mag = (rng.normal(0.0, sd, rates.shape) for sd in self.noise)
         rate = rates @ self.gyroscope_matrix.T + self.gyroscope_bias + gyr
@@ -75,14 +79,17 @@ class FaultySensor:
         return self.readings(up, north, np.zeros((count, 3)), seed)
 
     def posed(self, directions: Array, seed: int = 0, rest_s: float = 2.0) -> list[SensorReading]:
-        """Return readings of static poses with directions up, and of the movements between them."""
+        """Return readings of static poses and turns.
+
+        In each pose one of `directions` points up. A turn precedes every pose.
+        """
         rng = np.random.default_rng(seed)
         q, rates = posed_rotation(directions, rng, rest_s)
         up = rotation.rotate(rotation.conjugate(q), np.tile((0.0, 0.0, 1.0), (len(q), 1)))
         return self.readings(up, up, rates, rng)
 
     def turned(self, directions: Array, seed: int = 0, count: int = 400) -> list[SensorReading]:
-        """Return readings of a rotation that brings the field to each of some directions."""
+        """Return `count` readings in which the field is close to randomly drawn `directions`."""
         rng = np.random.default_rng(seed)
         chosen = directions[rng.integers(0, len(directions), count)]
         north = unit(chosen + rng.normal(0.0, 0.25, (count, 3)))
@@ -92,9 +99,12 @@ class FaultySensor:
 def posed_rotation(
     directions: Array, rng: np.random.Generator, rest_s: float, rate_hz: int = RATE_HZ
 ) -> tuple[Array, Array]:
-    """Return orientations, shape (n, 4), and rates of static poses and the turns between them."""
+    """Return orientations, shape (n, 4), and angular rates, rad/s, of static poses and turns.
+
+    In each pose one of `directions` points up. A turn precedes every pose.
+    """
     moving, still = round(MOVE_S * rate_hz), round(rest_s * rate_hz)
-    # speed 1 - cos: the turn begins and ends at rest
+    # the speed is proportional to 1 - cos(phase), so a turn begins and ends at rest
     phase = 2.0 * np.pi * np.arange(moving) / moving
     share, speed = (phase - np.sin(phase)) / (2.0 * np.pi), (1.0 - np.cos(phase)) / MOVE_S
     q, rates, pose = [], [], rotation.exp(rng.normal(size=3))
@@ -113,12 +123,12 @@ def posed_rotation(
 
 
 def unit(vectors: Array) -> Array:
-    """Return vectors of length 1."""
+    """Return the vectors, scaled to length 1."""
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
 def symmetric(rng: np.random.Generator, scale_sd: float, skew_sd: float) -> Array:
-    """Return a symmetric matrix near the identity."""
+    """Return a random symmetric matrix near the identity."""
     skew = np.triu(rng.normal(0.0, skew_sd, (3, 3)), 1)
     return np.diag(1.0 + rng.normal(0.0, scale_sd, 3)) + skew + skew.T
 
@@ -129,6 +139,6 @@ def poses() -> Array:
 
 
 def draws(count: int) -> Iterator[tuple[int, FaultySensor]]:
-    """Return sensors with different errors."""
+    """Yield `count` sensors with different errors, each with its seed."""
     for seed in range(count):
         yield seed, FaultySensor.draw(seed)

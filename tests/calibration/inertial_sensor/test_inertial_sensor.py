@@ -76,7 +76,7 @@ def test_gyroscope_bias_has_the_stated_uncertainty() -> None:
         found = fed(GyroscopeStep(), sensor.at_rest(8.0, seed)).finish()
         error = found.bias - sensor.gyroscope_bias
         errors.append(np.linalg.norm(error))
-        # Hotelling's T squared
+        # `distance` is proportional to Hotelling's T squared
         count, freedom = found.degrees_of_freedom, found.degrees_of_freedom - 2
         limit = f_distribution.ppf(0.95, 3, freedom) * count / freedom
         inside.append(distance(error, found.covariance) < limit)
@@ -96,7 +96,7 @@ def test_rest_begins_again_after_a_movement() -> None:
 
 
 def test_slow_rotation_is_no_rest() -> None:
-    # 2 degrees per second: the angular rate is constant, the inclination is not
+    # The sensor tilts by 2 degrees per second. Its rate is constant, but not its inclination.
     readings = SENSOR.at_rest(10.0)
     tilting = [
         reading._replace(
@@ -175,7 +175,7 @@ def test_the_same_pose_counts_once() -> None:
 
 def test_poses_without_tilt_between_two_axes_leave_the_axes_as_they_are() -> None:
     rng = np.random.default_rng(0)
-    flat = DIRECTIONS[:14]  # none between y and z
+    flat = DIRECTIONS[:14]  # no pose is tilted between y and z
     found = fit_accelerometer(GRAVITY * flat @ symmetric(rng, 0.02, 0.0) + rng.normal(0, 1e-3, 3))
     assert np.isnan(found.matrix_sd[1, 2])
     assert found.matrix[1, 2] == 0.0
@@ -232,7 +232,7 @@ def test_turns_between_poses_yield_scale_and_axes_of_the_gyroscope_with_their_un
 
 def test_a_scale_about_an_axis_that_never_turns_while_level_is_not_determined() -> None:
     turns = []
-    for angle in (0.5, 1.5, -1.0, 1.2, -1.2, 1.0, -1.5):  # about x alone
+    for angle in (0.5, 1.5, -1.0, 1.2, -1.2, 1.0, -1.5):  # all turns are about x
         q = rotation.exp(np.outer(np.linspace(0.0, 1.0, 50), (angle, 0.0, 0.0)))
         up = rotation.rotate(rotation.conjugate(q), np.tile((0.0, 0.0, 1.0), (50, 1)))
         rates = np.tile((1.03 * angle / 0.98, 0.0, 0.0), (50, 1))

@@ -1,4 +1,4 @@
-"""Published coordinate search on errors with a known minimum."""
+"""The published coordinate search finds the minimum of error functions with known minimum."""
 
 from __future__ import annotations
 

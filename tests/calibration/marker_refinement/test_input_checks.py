@@ -1,4 +1,4 @@
-"""Faults of model and trials that a refinement must report."""
+"""A refinement reports faults of the model and of the trials."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def trial(name: str = "walk", rate_hz: float = 100.0) -> MotionTrial:
 
 
 def changed(**markers: slice) -> MotionTrial:
-    """Return the trial with the named markers missing in some frames."""
+    """Return the trial with markers missing in the given frames, by marker name."""
     found = trial()
     for name, frames in markers.items():
         found.targets[frames, two_segments().marker_names.index(name)] = np.nan
@@ -170,7 +170,7 @@ def test_trials_of_different_rates_are_weighted_by_frames_with_a_note() -> None:
 
 def test_gauge_freedom_is_counted_and_named() -> None:
     found = refined(trial())
-    assert found.gauge.free == 6  # both segments may turn about the hip with all their markers
+    assert found.gauge.free == 6  # all markers of a segment may rotate about the hip together
     assert set(found.gauge.involved) <= set(two_segments().marker_names)
     assert found.gauge.fixed_by == "prior"
     unheld = refine_markers(two_segments(), [trial()], RefinementSettings(prior=0.0))

@@ -44,7 +44,10 @@ LOCKED = (True, True, True)
 
 
 def limb() -> ChainModel:
-    """Return a pelvis, a thigh and a shank; the markers near bone are locked."""
+    """Return a chain of pelvis, thigh and shank with five markers each.
+
+    All pelvis markers, and the first two markers of thigh and shank, are locked.
+    """
     rng = np.random.default_rng(3)
     segments = (
         Segment("pelvis"),
@@ -91,7 +94,7 @@ def test_without_noise_the_true_marker_positions_are_found(method: RefinementMet
 
 
 def test_the_step_is_that_of_the_whole_least_squares_problem() -> None:
-    """The expected step is from SciPy, which solves for poses and markers together."""
+    """The expected result is computed by SciPy, which solves for poses and markers together."""
     model, y = misplaced(limb()), seen(0.003)[::10]
     weights, free = np.ones(y.shape[:2]), ~model.locked
     problem = RefinementProblem(model, y, weights, free, 0.1, None)
@@ -166,7 +169,7 @@ def test_a_holdout_ends_the_iteration_with_the_best_positions() -> None:
 
 
 def clamped() -> ChainModel:
-    """Return the limb with a knee whose limits its own walk exceeds by up to 17 degrees."""
+    """Return the limb with knee limits that its walking movement exceeds by up to 17 degrees."""
     model = limb()
     hip, knee = model.segments[1:]
     short = replace(knee, joint=replace(knee.joint, limits=(-0.5, 1.0)))
@@ -212,7 +215,7 @@ def test_cost_l1_reduces_the_effect_of_a_marker_that_is_often_far_off(
     method: RefinementMethod,
 ) -> None:
     y = seen(0.001)
-    y[:20, 8] += 0.02  # thigh3 is off by less than the limit of the squared cost
+    y[:20, 8] += 0.02  # this error of thigh3 is below the Huber threshold of the squared cost
     off: dict[RefinementCost, float] = {}
     for cost in get_args(RefinementCost):
         settings = RefinementSettings(method, prior=0.001, cost=cost)

@@ -50,7 +50,7 @@ def fit(
     still: bool = False,
     learning: bool = False,
 ) -> Calibration:
-    """Calibrate with a changed movement; with `still`, the static pose has the same change."""
+    """Return a calibration whose movement, and with `still` also static pose, is changed."""
     static, functional, alignment = trials()
     pose = change(static) if still else static
     settings = LEARNING if learning else QUICK
@@ -58,7 +58,7 @@ def fit(
 
 
 def unplugged(after: float) -> Callable[[CalibrationTrial], CalibrationTrial]:
-    """Return a function that removes the data of S2 after a share of the movement."""
+    """Return a function that removes the data of S2 after the fraction `after` of a trial."""
 
     def change(trial: CalibrationTrial) -> CalibrationTrial:
         track = trial.sensors["S2"]
@@ -70,7 +70,7 @@ def unplugged(after: float) -> Callable[[CalibrationTrial], CalibrationTrial]:
 
 
 def hidden(share: float) -> Callable[[CalibrationTrial], CalibrationTrial]:
-    """Return a function that hides all markers for a share of the time, 0.25 s at a time."""
+    """Return a function that hides all markers for a fraction of the time, in parts of 0.25 s."""
 
     def change(trial: CalibrationTrial) -> CalibrationTrial:
         optical = trial.optical

@@ -1,4 +1,4 @@
-"""The calibration refines the markers of a chain model, and uses them if they fit better."""
+"""Refinement of chain-model markers in a calibration; it is used only if it reduces errors."""
 
 from __future__ import annotations
 
@@ -69,7 +69,10 @@ def true_model() -> ChainModel:
 
 
 def errors() -> Array:
-    """Return placement errors of thigh and shank markers, one of them locked, m."""
+    """Return the position errors of all markers in the model, m.
+
+    Only thigh and shank markers have an error, except for the locked marker thigh0.
+    """
     off = np.random.default_rng(8).normal(0.0, 0.007, (16, 3))
     off[:4] = off[12:] = off[4] = 0.0
     return off

@@ -41,7 +41,7 @@ WORN = Subject(5, flaws=Imperfections(sensor_deg=0.3, tissue_deg=3.0, skin_m=0.0
 
 @cache
 def trials() -> tuple[CalibrationTrial, CalibrationTrial, Motion]:
-    """Return static pose, movement with one marker displaced after the pose, and true motion."""
+    """Return a static pose, a movement with one displaced marker, and the true motion."""
     static, functional, moving = static_and_functional(WORN, 24.0)
     optical = functional.optical
     assert optical is not None
@@ -103,7 +103,7 @@ def test_the_error_decreases_on_the_held_out_part() -> None:
 
 
 def test_refinement_hardly_changes_markers_that_did_not_move() -> None:
-    subject = Subject(6)  # half a millimetre of noise
+    subject = Subject(6)  # its markers have a noise of 0.5 mm and are not displaced
     static, functional, _ = static_and_functional(subject, 18.0)
     clusters = fit_static(static, SETTINGS, CHAIN).clusters
     found = refine_clusters(clusters, track_clusters(optical_of(functional), clusters), 0.4)

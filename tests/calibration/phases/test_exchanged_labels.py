@@ -1,4 +1,4 @@
-"""Labels exchanged between the phases of a calibration are named in the refusal."""
+"""If labels are exchanged between the phases of a calibration, the refusal names the labels."""
 
 from __future__ import annotations
 

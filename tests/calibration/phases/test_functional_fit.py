@@ -1,4 +1,4 @@
-"""The whole calibration compared with the simulated geometry; impossible fits are refused."""
+"""Functional calibrations agree with the simulated geometry, or are refused with the reason."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_json_is_exact_through_text(clean: tuple[Subject, Calibration]) -> None:
 
 @pytest.fixture(scope="module")
 def short_trials() -> tuple[CalibrationTrial, CalibrationTrial]:
-    """Return a static and a functional trial without headings."""
+    """Return a static and a functional trial without heading errors of the sensor worlds."""
     subject = Subject(11, flaws=Imperfections(heading_deg=0.0))
     static, functional, _ = static_and_functional(subject, 12.0)
     return static, functional
@@ -115,7 +115,7 @@ def test_rotations_and_regression_coefficients_in_use_are_published(
     published = clean[1].quality["sensors"]
     for name, item in clean[1].sensor.items():
         assert tuple(published[name]["q_sensor_segment"]) == item.q_sensor_segment
-    assert "regression" not in clean[1].quality  # anchored
+    assert "regression" not in clean[1].quality  # its method is `anchored`
 
     found = regressed
     for segment, figures in found.quality["regression"].items():
@@ -136,7 +136,8 @@ def test_centers_are_published_in_coordinates_of_both_segments(
         assert 0.0 < found["noise_error_m"] < 0.001 < found["predicted_error_m"]
         assert found["segments"].keys() == {above, below}
 
-        # The joint is the origin of its distal segment, and the markers have a mean.
+        # The origin of the distal segment is the joint center. The origin of the published
+        # coordinates is the mean of the markers.
         in_distal = found["segments"][below]
         expected = -np.mean(LOCAL[below], axis=0)
         assert np.linalg.norm(np.subtract(in_distal["center_m"], expected)) < 0.015
@@ -147,7 +148,7 @@ def test_centers_are_published_in_coordinates_of_both_segments(
                 (3 - len(side["unseen"])) * found["predicted_error_m"] ** 2
             )
 
-    # At a hinge, the position along the axis is unobservable, and the axis points to the right.
+    # At a hinge, the position along the axis is unobservable. The axis points to the right.
     knee = centers["knee"]["segments"]["thigh"]
     assert knee["unseen"] == [knee["axis"]]
     assert abs(knee["axis"][0]) > 0.99

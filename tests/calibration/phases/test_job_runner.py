@@ -1,4 +1,4 @@
-"""Jobs of the worker process: the input of a calibration session, and the result."""
+"""Jobs of the worker process: alignments, previous calibrations and results of the fits."""
 
 from __future__ import annotations
 
@@ -41,7 +41,10 @@ def mounts() -> dict[str, np.ndarray]:
 
 
 def worlds(angles: dict[str, float]) -> PlateAlignment:
-    """Return an alignment in which every world is rotated about the vertical by its angle, rad."""
+    """Return an alignment in which the world of each sensor is rotated about the vertical.
+
+    `angles` contains the rotation by sensor, rad.
+    """
     return PlateAlignment(
         {
             name: AlignedSensor(

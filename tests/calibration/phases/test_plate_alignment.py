@@ -1,4 +1,4 @@
-"""World alignment from a plate turned by hand: recovered, or refused with the reason."""
+"""Alignments of sensor worlds from a rotated plate are correct, or refused with the reason."""
 
 from __future__ import annotations
 

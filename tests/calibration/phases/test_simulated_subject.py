@@ -1,4 +1,4 @@
-"""The simulated subject of the demo, calibrated offline."""
+"""Offline calibration of the simulated subject of the demo."""
 
 from __future__ import annotations
 

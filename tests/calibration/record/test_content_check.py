@@ -1,4 +1,4 @@
-"""Each fault of a stored calibration is named, and values at their limits are no fault."""
+"""The check names each fault of a stored calibration, and accepts values at their limits."""
 
 from __future__ import annotations
 
@@ -37,7 +37,10 @@ def content() -> dict[str, Any]:
 
 
 def faults_with(path: str, value: object) -> list[str]:
-    """Return the faults of a calibration with one other value; numbers in a path are indices."""
+    """Return the faults of a calibration in which the value at a path is replaced.
+
+    Numbers in the path are indices.
+    """
     changed = content()
     table: Any = changed
     *keys, last = [int(key) if key.isdigit() else key for key in path.split("/")]

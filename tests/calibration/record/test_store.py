@@ -1,4 +1,4 @@
-"""The store: complete versions only, no overwriting, and reports of damaged versions."""
+"""The store writes only complete versions, overwrites none, and reports damaged versions."""
 
 from __future__ import annotations
 

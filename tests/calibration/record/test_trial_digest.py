@@ -27,7 +27,7 @@ TRIAL = CalibrationTrial({"S1": TRACK, "S2": OTHER}, CAMERAS)
 
 
 def test_the_digest_is_that_of_the_named_bytes() -> None:
-    """The digests of stored calibrations stay valid, on machines of either byte order."""
+    """Digests are equal on machines of both byte orders, and equal those of earlier versions."""
     track = SensorTrack(T_NS, np.array([[1.0, 0.0, 0.0, 0.0]] * 2))
     big = SensorTrack(T_NS.astype(">i8"), track.q_world_sensor.astype(">f8"))
     one = np.array([1.0, 0.0, 0.0, 0.0], dtype="<f8").tobytes()

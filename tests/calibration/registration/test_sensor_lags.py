@@ -1,4 +1,4 @@
-"""Lag of a calibration: plate and movement, weighted by their standard deviations."""
+"""Lags of a calibration, from plate and movement weighted by their standard deviations."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_sensor_with_a_plate_lag_corrects_the_soft_tissue_lag_of_its_neighbor() 
     alone = segment_lags(moving, {})["S2"]
     taught = segment_lags(moving, {"S1": (round(5 * MS), 0.1 * MS)})["S2"]
     assert alone.lag_ns == 14 * MS
-    assert 10 * MS < taught.lag_ns < 12 * MS  # S1 has a soft-tissue bias of 4 ms, most of it common
+    assert 10 * MS < taught.lag_ns < 12 * MS  # S1 has a bias of 4 ms, which S2 mostly shares
     assert taught.sigma_ns is not None
     assert alone.sigma_ns is not None
     assert taught.sigma_ns < alone.sigma_ns

@@ -1,4 +1,4 @@
-"""Alignment of world and mount: estimated if the movement determines it, otherwise refused."""
+"""Alignments of world and sensor are estimated if the movement determines them, else refused."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ N = 600
 
 
 def walk(rng: np.random.Generator, axis: tuple[float, ...] | None = None) -> Array:
-    """Return orientations of a plate turned by hand, about one fixed axis if given."""
+    """Return orientations of a plate that is rotated by hand, about `axis` only if it is given."""
     steps = rng.normal(0, 0.08, (N, 3)) if axis is None else rng.normal(0, 0.08, (N, 1)) * axis
     q = np.empty((N, 4))
     q[0] = rot.IDENTITY

@@ -36,7 +36,7 @@ def test_outliers_change_a_robust_mean_less_than_a_plain_mean() -> None:
     q = rot.multiply(truth, rot.exp(DEG * rng.normal(size=(500, 3))))
     q[::5] = rot.multiply(q[::5], rot.exp([0.8, 0.5, 0.0]))
     robust = robust_mean(q * rng.choice([-1.0, 1.0], 500)[:, None])
-    # All outliers have the same rotation, which is the worst case for weights above zero.
+    # All outliers have the same rotation. For weights above zero this is the worst case.
     assert rot.angle_between(robust.q, truth) < 1.2 * DEG
     assert rot.angle_between(rot.average(q), truth) > 5 * DEG
     assert robust.spread < 3 * DEG

@@ -1,4 +1,4 @@
-"""Detection of rest, live and recorded: simulated movements with known rest, recorded board."""
+"""Detection of rest, live and in recordings: simulated movements and a recorded board."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def verdicts(q: NDArray[np.float64], rate: float = RATE) -> NDArray[np.bool_]:
 def test_rest_is_found_and_motion_is_not_rest() -> None:
     gyr, acc, q = swinging()
     for still in (still_from_rates(gyr, acc, RATE), still_from_orientation(q, RATE)):
-        assert np.mean(still[REST]) > 0.88  # half a window before the movement is lost
+        assert np.mean(still[REST]) > 0.88  # the half window before the movement does not count
         assert not still[SWING].any()
 
 
@@ -117,7 +117,7 @@ def test_unknown_orientations_are_not_still() -> None:
     still = still_from_orientation(q, RATE)
     assert not still[300]
     assert still[50]
-    assert not still_from_orientation(q[:50], RATE).any()  # shorter than a window
+    assert not still_from_orientation(q[:50], RATE).any()  # the recording is shorter than a window
 
 
 @pytest.mark.parametrize(
@@ -130,4 +130,4 @@ def test_motion_of_a_recorded_board_is_never_stillness(shared_data: Path, name: 
         from_orientation = still_from_orientation(trial["opt_quat"], rate)
     assert from_rates[moving].mean() <= 0.002
     assert from_orientation[moving].mean() <= 0.01
-    assert from_orientation[~moving].mean() > 0.6  # 2 s of rest, less half a window
+    assert from_orientation[~moving].mean() > 0.6  # rests of 2 s lose half a window

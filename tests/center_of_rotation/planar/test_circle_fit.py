@@ -1,4 +1,4 @@
-"""Circle fits: closed form, streaming and batch, predicted and actual error."""
+"""Circle fits: closed form, equality of streaming and batch fit, predicted and actual error."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def test_robust_running_circle_reduces_weight_of_a_jump() -> None:
 
 
 @given(st.lists(st.tuples(anything, anything), max_size=40), st.sampled_from(METHODS))
-@example([(0.0, 0.5620884694558803), *(8 * [(0.0, 0.0)])], "kasa")  # variance -6e-17
+@example([(0.0, 0.5620884694558803), *(8 * [(0.0, 0.0)])], "kasa")  # rounded variance: -6e-17
 @settings(deadline=None)
 def test_circle_estimate_of_any_points_is_finite_or_refused(points: Any, method: Any) -> None:
     with np.errstate(all="ignore"):
@@ -254,7 +254,7 @@ def test_arc_of_spread_recovers_the_arc(arc: float) -> None:
 
 
 def test_arcs_are_counted_between_the_outermost_points() -> None:
-    t = np.linspace(3.0, 4.0, 40)  # across the discontinuity of atan2
+    t = np.linspace(3.0, 4.0, 40)  # the angles cross the discontinuity of atan2 at π
     p = np.stack((np.cos(t), np.sin(t)), axis=-1)
     assert arc_about(p, np.zeros(2)) == pytest.approx(1.0)
     t = np.linspace(0, 2 * pi, 40)
@@ -266,7 +266,10 @@ def test_arcs_are_counted_between_the_outermost_points() -> None:
 
 
 def covered(truth: float) -> tuple[float, float]:
-    """Integrate the coverage of published centers for T ~ N(truth, 1) and unlimited frames."""
+    """Return coverage and fraction of the published centers, for T ~ N(truth, 1).
+
+    Both are integrated over T. The number of frames is assumed to be unlimited.
+    """
     z, dz = np.linspace(-9, 9, 20_001, retstep=True)
     t = truth + z
     z, t = z[t >= GATE], t[t >= GATE]

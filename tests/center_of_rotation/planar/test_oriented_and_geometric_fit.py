@@ -1,4 +1,4 @@
-"""Orientation-aided and geometric circle fits."""
+"""Orientation-aided and geometric circle fits: errors, limits and degenerate input."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_degenerate_paths_give_no_warning_and_a_finite_estimate(points: Any) -> 
 @given(
     st.lists(st.tuples(values, values, st.floats(-4.0, 4.0)), max_size=30),
 )
-@example(  # noise larger than one variance of the points
+@example(  # the noise variance exceeds the variance of the points along one axis
     [
         (0.0, 0.75, 1.0),
         (0.75, 0.0, 0.0),

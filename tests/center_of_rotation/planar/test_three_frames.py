@@ -1,4 +1,4 @@
-"""Three-frame centers, their predicted errors, grid search and bounds."""
+"""Three-frame centers with predicted errors; planes, grid search and Cramér-Rao bounds."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ def test_three_points_of_a_circle_give_its_center(
 
 
 @given(st.lists(anything, min_size=6, max_size=6))
-@example([0.0, 0.0, 7e-155, 0.0, 0.0, 7e-155])  # squares that vanish
+@example([0.0, 0.0, 7e-155, 0.0, 0.0, 7e-155])  # the squares underflow
 @example([0.0, 0.0, 2e-162, 1e-162, 1e-162, 2e-162])
 @example([0.0, 0.0, 5e-324, 0.0, 0.0, 5e-324])
-@example([0.0, 0.0, 1e200, 0.0, 0.0, 1e200])  # squares that overflow
+@example([0.0, 0.0, 1e200, 0.0, 0.0, 1e200])  # the squares overflow
 @example([1e308, 0.0, -1e308, 0.0, 0.0, 1.0])
-@example([1.0, 1.0, 1.0, 1.0 + 2**-52, 1.0 + 2**-52, 1.0])  # a center that rounds to a point
-@example([0.0, 0.0, 1.0, 0.0, 2.0, 5e-9])  # nearly a line
+@example([1.0, 1.0, 1.0, 1.0 + 2**-52, 1.0 + 2**-52, 1.0])  # the center rounds to a point
+@example([0.0, 0.0, 1.0, 0.0, 2.0, 5e-9])  # the points are nearly on a line
 def test_three_frame_estimate_of_any_points_is_finite_or_refused(values: Any) -> None:
     with np.errstate(all="ignore"):
         found = three_frame_estimate(np.reshape(values, (3, 2)), 0.001)
@@ -62,7 +62,7 @@ def test_three_frame_estimate_of_any_points_is_finite_or_refused(values: Any) ->
     assert not np.isnan([found.rms_error, found.arc, found.bound, found.conditioning]).any()
     assert np.isfinite(found.radii).all()
     if found.refused is not None:
-        assert ":" in found.refused  # cause: remedy
+        assert ":" in found.refused  # the text has the form "cause: remedy"
 
 
 def test_the_covariance_is_the_bound_of_three_points() -> None:

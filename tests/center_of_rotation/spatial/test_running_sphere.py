@@ -1,4 +1,4 @@
-"""Streaming sphere fit: equal to the batch fit, calibrated, and robust."""
+"""Streaming sphere fit: equality with the batch fit, predicted error, and outliers."""
 
 from __future__ import annotations
 

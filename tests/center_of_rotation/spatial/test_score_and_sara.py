@@ -1,4 +1,4 @@
-"""SCoRE, SARA, fused estimates and the noise of the parent's frame."""
+"""Centers and axes by SCoRE and SARA, fused estimates, and noise of the parent's frame."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_a_shared_unseen_direction_stays_unseen() -> None:
     rng = np.random.default_rng(9)
     paths = carried(hinge_turns(60.0, axis=0))
     found = [fit_running((paths + rng.normal(0, 1e-4, paths.shape))[:, [j]]) for j in range(3)]
-    # one axis for all, as a user gives it
+    # all three estimates get the same axis, like an axis that a user configures
     common = [replace(f, unseen=found[0].unseen, axis=found[0].axis) for f in found]
     fused = fuse_centers(common)
     assert fused.rms_error == inf

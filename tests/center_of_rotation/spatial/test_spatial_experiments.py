@@ -1,4 +1,4 @@
-"""Spatial joint-center experiments meet their targets."""
+"""The benchmark experiments on joint centers in space meet their targets."""
 
 from __future__ import annotations
 

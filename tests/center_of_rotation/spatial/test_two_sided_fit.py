@@ -40,7 +40,7 @@ def test_noise_of_distant_clusters_does_not_bias_the_center() -> None:
     mean = np.mean([e.center for e in found], axis=0)
     allowed = 4.0 * np.sqrt(np.mean([np.trace(e.covariance) for e in found]) / len(found))
     assert np.linalg.norm(mean) < allowed
-    # the same trials without knowledge of the markers
+    # without the markers, the centers of the same trials are biased
     assert np.linalg.norm(np.mean([plain_center(trial) for trial in trials], axis=0)) > allowed
 
 
@@ -50,7 +50,7 @@ def test_the_ellipsoid_covers_the_center_in_small_and_large_movements(rom: float
     held = [
         covers(estimate_center(subject(k, 3 + k % 2).observe(rng, rom, 1e-3))) for k in range(40)
     ]
-    assert sum(held) >= 33  # 38 expected, with a standard error of 1.4
+    assert sum(held) >= 33  # expected: 38 of 40, with a standard deviation of 1.4
 
 
 def test_the_noise_of_a_marker_is_recovered() -> None:
@@ -60,7 +60,7 @@ def test_the_noise_of_a_marker_is_recovered() -> None:
 
 
 def adjusted_center(person: Subject, above: Array, below: Array, start: Array) -> Array:
-    """Return the parent's point of the exact adjustment of all markers, by general optimization."""
+    """Return the center in the parent from a fit of poses and center to all markers, by SciPy."""
     n = len(above)
 
     def residuals(x: Array) -> Array:
@@ -88,7 +88,7 @@ def test_center_agrees_with_an_adjustment_of_all_markers() -> None:
     child = type(seen.child)(seen.child.q[parts], seen.child.t[parts])
     found = fit_score(parent, child, robust=False, markers=(person.parent, person.child))
 
-    # markers that give exactly these poses, and noise that no rigid motion explains
+    # These markers have exactly the poses of the trial.
     above = rotation.rotate(parent.q[:, None], person.parent) + parent.t[:, None]
     below = rotation.rotate(child.q[:, None], person.child) + child.t[:, None]
     turned = rotation.log(rotation.multiply(rotation.conjugate(parent.q), child.q))

@@ -1,4 +1,4 @@
-"""The BNO085 driver against the conformance suite of drivers, in both modes."""
+"""Conformance tests of the BNO085 driver, in both modes."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class TestBno085Shtp(TestBno085Rvc):
 
 @pytest.mark.skipif(find_spec("vqf") is None, reason="the extra vqf is not installed")
 class TestBno085Raw(TestBno085Shtp):
-    """Raw readings on the wire, orientation on the gateway."""
+    """The device sends raw readings, and the gateway computes the orientation."""
 
     @override
     def make_driver(self, folder: Path) -> Driver:

@@ -1,4 +1,4 @@
-"""BNO085 decoders: orders of Euler angles, ages, numbers, damage and restarts."""
+"""Decoders of the BNO085: axis orders, ages, report numbers, damaged data and restarts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The BNO085 driver with devices in both modes, and the settings that the driver changes."""
+"""Start of the BNO085 driver with devices in both modes, and the settings that it changes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The can-table driver against the conformance suite of drivers, over SLCAN and in one process."""
+"""Conformance tests of the can-table driver, over SLCAN and on an in-process bus."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class TestTimeAndQuaternionOverSlcan(DriverContract):
 class TestHalvesOfFloatsWith29BitIds(TestTimeAndQuaternionOverSlcan):
     table = HALVES
 
-    # A flipped bit of a digit on the adapter's line is another number, and one of float32 mantissa
-    # bits changes the norm too little to be detected.
+    # A flipped bit can change a digit on the adapter's line to another digit. A change of a float32
+    # mantissa can be too small to be detected by the norm.
     test_line_noise_affects_only_damaged_samples = None  # type: ignore[assignment]
 
 

@@ -1,4 +1,4 @@
-"""The decoder of frames that a table describes: reasons why no sample is complete."""
+"""Warnings of the can-table decoder that state why no sample is complete."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ def calibrated(sensor: FaultySensor) -> SensorCalibrationSettings:
 
 
 def orientation_error(sensor: FaultySensor, calibration: SensorCalibrationSettings | None) -> float:
-    """Return the RMS error, rad, of 20 s of slow rotation after 10 s."""
+    """Return the RMS error of the orientation in slow rotation, from 10 s to 30 s, rad."""
     t_s = np.arange(30 * RATE_HZ) / RATE_HZ
     turns = 1.2 * np.column_stack([np.sin((0.5 + 0.2 * k) * t_s + k) for k in range(3)])
     q = rotation.exp(turns)

@@ -1,4 +1,4 @@
-"""An IMU that starts in motion: errors of orientation and gyroscope bias, and stated deviation."""
+"""Filter of an IMU that starts in motion: errors of orientation and bias, and stated deviation."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def test_filter_takes_over_at_rest_without_a_jump() -> None:
 
 
 def test_disturbed_fields_do_not_turn_the_start() -> None:
-    """For half a second the field is three times as strong, from another direction."""
+    """For half a second, the field has three times the usual strength and another direction."""
     clean = sensor(3)
     readings = [
         reading._replace(magnetic=(90.0, 90.0, 10.0)) if 150 <= k < 200 else reading

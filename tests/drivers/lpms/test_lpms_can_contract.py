@@ -1,4 +1,4 @@
-"""The driver of LPMS sensors on CAN against the conformance suite, over SLCAN."""
+"""Conformance tests of the driver of LPMS sensors on CAN, over SLCAN and in process."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def settings(
 
 
 class TestLpmsInCanopenStyle(DriverContract):
-    """Integers of 16 bits, all four frames, and a heartbeat."""
+    """The sensor sends 16-bit integers in all four frames, and a heartbeat."""
 
     registered_as = "lpms-can"
     numbers = tpdo_ids(1)
@@ -65,7 +65,7 @@ class TestLpmsInCanopenStyle(DriverContract):
 
 
 class TestLpmsInSequentialMode(TestLpmsInCanopenStyle):
-    """Floats of 32 bits, adjacent identifiers, and no idle frames."""
+    """The sensor sends 32-bit floats with consecutive identifiers, and no unused frames."""
 
     numbers = sequential_ids(1, spaced=False)
     mode, precision = "sequential", "float32"
@@ -82,7 +82,7 @@ class TestLpmsInSequentialMode(TestLpmsInCanopenStyle):
 
     @override
     def matches(self, number: int, measurement: Any) -> bool:
-        """Return whether `measurement` is a sample, within 0.09 rad.
+        """Return whether `measurement` has the orientation of sample `number`, within 0.09 rad.
 
         The line of an adapter has no checksum. A wrong digit of a small component changes the norm
         by less than 1 %, which is accepted, and the orientation by less than 0.09 rad.
@@ -92,7 +92,7 @@ class TestLpmsInSequentialMode(TestLpmsInCanopenStyle):
 
 
 class TestLpmsOfOldFirmwareOnABusWithoutDescriptor(DriverContract):
-    """Values in thousandths, and spaced identifiers, on an in-process bus."""
+    """The sensor sends thousandths with spaced identifiers on an in-process bus."""
 
     registered_as = "lpms-can"
     has_noise = False

@@ -1,4 +1,4 @@
-"""The driver of LPMS sensors on serial lines against the conformance suite of drivers."""
+"""Conformance tests of the driver of LPMS sensors on serial lines."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class TestLpmsOfGeneration3(DriverContract):
 
 
 class TestLpmsOfGeneration1(TestLpmsOfGeneration3):
-    """Old firmware: thousandths in 16 bits, no acknowledgements, already configured."""
+    """Old firmware that is already configured sends 16-bit thousandths and acknowledges nothing."""
 
     # Every connection waits for acknowledgements that this firmware does not send.
     starts_within_s = 15.0
@@ -68,7 +68,7 @@ class TestLpmsOfGeneration1(TestLpmsOfGeneration3):
 
 
 class TestLpmsWithLongAddressAndOtherConvention(TestLpmsOfGeneration3):
-    """Checksum over words, orientation from sensor to ENU, and command mode at the start."""
+    """The checksum sums words, the world is ENU, and the sensor starts in command mode."""
 
     @override
     def make_device(self, folder: Path, wire_noise: WireNoise) -> LpmsDevice:

@@ -1,4 +1,4 @@
-"""The decoder of LPMS sensors on serial lines: vectors, time, and faults of the stream."""
+"""The decoder of LPMS sensors on serial lines: test vectors, time, and faults of the stream."""
 
 from __future__ import annotations
 
@@ -201,7 +201,7 @@ def test_float_seconds_that_nothing_announces_are_reported() -> None:
     assert texts(back, "warning") == ['device time is not float seconds: set device_time = "ticks"']
 
 
-ORDERS = {  # from the vendor's register lists: values before and after the quaternion
+ORDERS = {  # from the vendor: value counts of the outputs before and after the quaternion
     1: ((3, 3, 3, 3), (3, 3, 1, 1, 1, 1)),
     3: ((3,) * 11, (3, 3, 1, 1, 1)),
 }
@@ -239,7 +239,7 @@ def test_the_quaternion_is_found_without_a_reply_that_names_the_outputs(
 
 
 def test_an_acceleration_at_rest_is_no_quaternion() -> None:
-    """Gravity in units of g has norm 1, with a rate of 0 before or after it."""
+    """A rate of 0 and gravity in g together have norm 1, like a quaternion."""
     rng, wires = Random(1), []
     for number in range(20):
         force = [rng.gauss(mean, 0.002) for mean in (0.6, 0.0, 0.8)]

@@ -52,7 +52,7 @@ def device_on(folder: Path, **options: Any) -> LpmsDevice:
 
 
 async def sampled(device: LpmsDevice, driver: LpmsImu, count: int = 5) -> DriverRun:
-    """Run until `count` samples arrived; raises the error of the driver."""
+    """Run until `count` samples have arrived; raise the error of the driver, if any."""
     async with serving(device, feeding=True):
         run = DriverRun(driver)
         try:
@@ -130,10 +130,10 @@ async def test_the_wrong_generation_is_refused_before_any_harm(
 
 
 async def test_commands_of_the_other_generation_do_harm_in_the_simulator(tmp_path: Path) -> None:
-    """Without an identification, the driver uses its settings, which may be wrong."""
+    """If the sensor reports no generation, the driver uses `generation`, which may be wrong."""
     third = device_on(tmp_path, generation=3, identifies=False)
     await refusal(third, make(tmp_path, generation=1), DeviceLostError)
-    assert third.flash_writes > 0  # the read 04 of generation 1
+    assert third.flash_writes > 0  # caused by the read command 0x04 of generation 1
 
     reset = device_on(tmp_path, configuration=LpmsConfiguration(GENERATION_3.quaternion, 50, True))
     reset.streaming = False

@@ -1,4 +1,4 @@
-"""The driver of LSL streams against the conformance suite, with real outlets of liblsl."""
+"""Conformance tests of the driver of LSL streams, with real outlets of liblsl."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.real_time, pytest.mark.usefixtures("lsl_network")]
 
 SOURCE = f"contract-{os.getpid()}"
-"""Other processes of this host have streams, too."""
+"""Identifier of the streams of this process; other processes of this host may have streams."""
 
 
 class TestLslMarkers(MocapContract):

@@ -1,4 +1,4 @@
-"""Connections to real streams: search, reconnection, clocks, and errors with their remedy."""
+"""Connections to real LSL streams: search, reconnection, clocks, and errors with their remedy."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.real_time
 
 SOURCE = f"session-{os.getpid()}"
-"""Other processes of this host have streams, too."""
+"""Identifier of the streams of this process; other processes of this host may have streams."""
 
 
 def settings(**keys: Any) -> LslMarkersSettings:

@@ -25,7 +25,7 @@ def settings(folder: Path | None = None, **more: Any) -> MipSettings:
 
 
 def filter_packet(t_ns: int | None, valid: int = 1, q: tuple[float, ...] = NATIVE) -> bytes:
-    """Return a packet of the filter; without time if it is None."""
+    """Return a packet of the filter data set; without a time field if `t_ns` is None."""
     time = () if t_ns is None else (encode_field(0x82, 0xD5, t_ns),)
     return encode(0x82, (*time, encode_field(0x82, 0x03, *q, valid)))
 
@@ -35,7 +35,7 @@ def sensor_packet(t_ns: int, q: tuple[float, ...] = NATIVE) -> bytes:
 
 
 def decoded(packets: list[bytes], **more: Any) -> list[Decoded]:
-    """Decode packets that arrive one period after the other."""
+    """Return the output of a decoder for packets that arrive at intervals of one period."""
     decoder = MipImu(settings(**more)).decoder()
     found = [
         event

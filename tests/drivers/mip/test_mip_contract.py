@@ -1,4 +1,4 @@
-"""The MIP driver against the conformance suite of drivers."""
+"""Conformance tests of the MIP driver."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class TestMip(DriverContract):
 
 
 class TestMipLegacyThatStreamsBothSetsFromTheStart(TestMip):
-    """Old samples come first, and orientations of the other data set between the samples."""
+    """The device sends old samples first, and also orientations of the other data set."""
 
     @override
     def make_device(self, folder: Path, wire_noise: WireNoise) -> MipDevice:
@@ -61,7 +61,7 @@ class TestMipLegacyThatStreamsBothSetsFromTheStart(TestMip):
 
 @pytest.mark.skipif(find_spec("vqf") is None, reason="the extra vqf is not installed")
 class TestMipWithRawMeasurements(TestMip):
-    """Raw measurements on the wire, orientation on the gateway."""
+    """The device sends raw measurements, and the gateway computes the orientation."""
 
     has_history = True
 

@@ -1,4 +1,4 @@
-"""Bytes of MIP devices to samples: time, validity, data sets and faults."""
+"""Decoder of MIP devices: time, validity, data sets and faults."""
 
 from __future__ import annotations
 

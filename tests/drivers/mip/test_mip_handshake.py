@@ -1,4 +1,4 @@
-"""The MIP handshake against simulated devices with every setting and fault."""
+"""Handshake of the MIP driver with simulated devices, for every setting and fault."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The vendor's library reads the same values from the packets of the virtual device."""
+"""The vendor's library reads the values that the virtual MIP device has encoded."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Recorder:
 
 
 def read_by_vendor(packets: list[bytes]) -> list[dict[str, Any]]:
-    """Return the channels of each packet, by the vendor's library on a pty."""
+    """Return the channels of each packet as the vendor's library reads them from a pty."""
     near, far = os.openpty()
     tty.setraw(far)
     connection = mscl.Connection.Serial(os.ttyname(far), 115_200)

@@ -1,4 +1,4 @@
-"""A server that only answers is reported once, and loses none of its answers."""
+"""`ServerOutput` of a server without frames: one report of the loss, and no lost answer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Names in rig.toml and ids on the wire."""
+"""Assignment of the names in rig.toml to the ids in NatNet frames."""
 
 from __future__ import annotations
 

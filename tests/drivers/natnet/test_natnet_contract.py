@@ -1,4 +1,4 @@
-"""The NatNet driver against the conformance suite of drivers."""
+"""Conformance tests of the NatNet driver."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class TestNatNet25(TestNatNet29):
 
 
 def multicast_works() -> bool:
-    """Whether loopback carries multicast on this machine."""
+    """Return whether the loopback interface of this machine transports multicast."""
     lo, group = socket.inet_aton("127.0.0.1"), "239.255.42.99"
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heard,

@@ -1,4 +1,4 @@
-"""Every cause of "connected, but no data" is named when it is present, and only then."""
+"""NatNet diagnosis: a cause of "connected, but no data" is named if and only if it is present."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
 def served(
     server: NatNetServer, scene: Any, before: Before = lambda _: None
 ) -> AbstractAsyncContextManager[None]:
-    """Answer, and send a frame every 10 ms; `scene` None sends none."""
+    """Run a server that answers and, unless `scene` is None, sends a frame every 10 ms."""
 
     def push() -> None:
         before(server)

@@ -1,4 +1,4 @@
-"""Frames stamped by PTP, and frames with a timecode."""
+"""Times of NatNet frames: PTP time stamps and timecodes."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_the_unit_of_time_fractions_is_detected() -> None:
         true = [SECONDS * NS + k * NS // 3 for k in range(FRAMES)][-len(ticks) :]
         assert all(abs(a - b) <= 1 for a, b in zip(ticks, true, strict=True))
         assert len(ticks) >= FRAMES - DECIDING + 1
-        assert len(ticks) > FRAMES - 4 or unit == NS  # 2^-32 s is known early
+        assert len(ticks) > FRAMES - 4 or unit == NS  # units of 2^-32 s are detected early
 
 
 def test_a_clock_on_ptp_is_unix_time_less_the_leap_seconds() -> None:

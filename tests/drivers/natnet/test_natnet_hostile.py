@@ -1,4 +1,4 @@
-"""Invalid numbers, names and answers: memory is bounded, and they are counted and not used."""
+"""Invalid input of a NatNet server is counted and not used, and the memory is bounded."""
 
 from __future__ import annotations
 

@@ -122,7 +122,7 @@ async def test_arrival_is_stamped_by_the_kernel_before_the_daemon_wakes() -> Non
         count, before = len(heard.measurements), time.monotonic_ns()
         server.push(time.monotonic_ns(), *SCENE)
         after = time.monotonic_ns()
-        time.sleep(0.05)  # noqa: ASYNC251 - the loop is to be late
+        time.sleep(0.05)  # noqa: ASYNC251 - delays the event loop
         await until(lambda: len(heard.measurements) > count, None)
     assert before - 1_000_000 <= heard.measurements[count].arrival_ns <= after + 5_000_000
 
@@ -268,7 +268,7 @@ async def test_silence_names_the_transport_where_it_contradicts_the_server(
 async def test_a_server_that_answers_but_sends_no_frames_is_lost_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The source is reopened only when the first frame has arrived."""
+    """The second connection emits its answers only with the first frame."""
     monkeypatch.setattr(_session, "FIRST_ECHOES", 1)
     server = serve()
     table = {"driver": "natnet", "server": "127.0.0.1", "silence_s": 0.2}

@@ -32,7 +32,7 @@ class Traffic(NamedTuple):
     """Content of the capture."""
 
     frames: list[tuple[int, FrameOfData]]
-    """Arrival, ns, and frame."""
+    """Each frame with its arrival time, ns."""
     echoes: list[ClockEcho]
 
     def ticks(self, field: str) -> NDArray[np.int64]:
@@ -152,11 +152,11 @@ def test_by_the_quickest_echo_frames_travel_their_known_times(traffic: Traffic) 
     ):
         said = (found[0], np.median(found), np.percentile(found, 99), found[-1])
         assert said == pytest.approx(expected, abs=0.02)
-    assert (transit > 2.01).sum() == 1  # the next smaller value is 2.003
+    assert (transit > 2.01).sum() == 1  # the next smaller value is 2.003 ms
 
 
 def test_lost_and_late_echoes_leave_the_offset_where_it_was(traffic: Traffic) -> None:
-    """Any three of nine are lost and any two of the rest come 20 ms late: 1 260 cases."""
+    """Any three of nine echoes are lost, and any two others are 20 ms late: 1260 cases."""
     echoes = traffic.echoes
     whole = fitted(echoes)
     middle = server_ns((echoes[0].ticks + echoes[-1].ticks) // 2)
@@ -180,5 +180,5 @@ def test_lost_and_late_echoes_leave_the_offset_where_it_was(traffic: Traffic) ->
     assert np.percentile(at_middle, 99) <= 50_000
     # The error is largest if three of the four remaining punctual echoes are neighbours.
     assert at_middle.max() <= 60_000
-    # The error is larger if all remaining punctual echoes are long before the last one.
+    # The error at the last echo is larger if all remaining punctual echoes are much earlier.
     assert np.percentile(at_last, 95) <= 50_000

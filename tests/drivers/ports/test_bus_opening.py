@@ -1,4 +1,4 @@
-"""Buses that cannot be opened: servers that are off or silent, and libraries that hang."""
+"""CAN buses that cannot be opened: servers that are off or silent, and libraries that hang."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ async def test_a_connection_that_is_reset_is_reported_without_a_traceback() -> N
     with listening() as (server, port):
 
         def serve() -> None:
-            for _ in range(2):  # the check of the server, and the bus
+            for _ in range(2):  # first the check of the server, then the bus
                 connection, _ = server.accept()
                 connection.sendall(b"< hi >")
                 for _ in range(2):
@@ -187,7 +187,7 @@ async def test_a_library_that_hangs_is_called_by_one_thread_only_and_its_late_bu
 
 @contextlib.contextmanager
 def answering(server: socket.socket, answers: list[bytes], frames: bytes = b"") -> Iterator[None]:
-    """Send each client the first answer, then one for each of its texts, then frames."""
+    """Send each client the first answer, one answer for each of its texts, and then `frames`."""
 
     def serve() -> None:
         while True:

@@ -1,4 +1,4 @@
-"""Shared CAN buses: distribution of frames, failures of a user, and error messages."""
+"""Shared CAN buses: distribution of frames, failures of one driver, and error messages."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ async def test_two_sensors_on_one_adapter_each_get_their_own(tmp_path: Path) -> 
 
 
 class Eager(SlcanAdapter):
-    """Adapter that sends a sensor's first group in the same write as its answer to `O`."""
+    """Adapter that sends a sensor's first group in the same write as its answer to open."""
 
     sensor: XcdiDevice
     group: list[CanFrame] | None = None

@@ -44,7 +44,7 @@ def test_a_stepped_wall_clock_moves_no_frame(step_s: float) -> None:
     clocks.offset += round(step_s * S)
     clocks.monotonic += 1_000_000
     stamps.pair()
-    if abs(step_s) > 2:  # a small step has the same effect as a wait of the frame
+    if abs(step_s) > 2:  # a small step looks like a delay of the frame
         assert stamped(clocks, stamps, 500_000, before) == pytest.approx(500_000, abs=300)
     assert stamped(clocks, stamps, 200_000) == pytest.approx(200_000, abs=300)
     assert stamps.replaced == 0

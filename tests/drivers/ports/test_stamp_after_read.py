@@ -1,4 +1,4 @@
-"""Data that arrive while the process is delayed before a read have no stamp before their arrival.
+"""Stamps of data that arrive while a read is delayed are never earlier than the arrival.
 
 Clock models use the earliest arrivals, so a stamp that is milliseconds early shifts a clock for a
 minute. A late stamp has no effect.
@@ -64,7 +64,7 @@ async def test_serial_bytes_that_arrive_during_a_delay_are_stamped_after_their_a
         time.sleep(HELD_UP_S)
         came_ns.append(time.monotonic_ns())
         os.write(far, b"y")
-        while waiting(fd) < 2:  # the kernel takes its time from one end to the other
+        while waiting(fd) < 2:  # the kernel needs time to transfer the byte
             time.sleep(0.001)
         return read(fd, size)
 
@@ -155,7 +155,7 @@ def test_datagrams_without_kernel_stamp_are_stamped_after_their_arrival() -> Non
     actual = opened._socket
     unstamped = WithoutStamps(actual)
     try:
-        opened._socket = unstamped  # type: ignore[assignment]  # as far as it is used
+        opened._socket = unstamped  # type: ignore[assignment]  # has the used methods
         arrivals = opened.receive()
     finally:
         actual.close()

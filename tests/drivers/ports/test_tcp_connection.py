@@ -1,4 +1,4 @@
-"""TCP connections: arrival stamps, closed and silent servers, connections back."""
+"""TCP connections: arrival stamps, closed and silent servers, and connections from servers."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ def made(**options: Any) -> QtmServer:
 def served(
     server: QtmServer, *, sends: bool = True, before: Callable[[], None] = lambda: None
 ) -> AbstractAsyncContextManager[None]:
-    """Answer, and send a frame every 10 ms."""
+    """Run a server that answers, and sends a frame every 10 ms."""
 
     def push() -> None:
         before()

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.real_time
 
 
 def single(value: float) -> float:
-    """Return the nearest number of 32 bits."""
+    """Return the nearest float of 32 bits."""
     return float(struct.unpack("<f", struct.pack("<f", value))[0])
 
 

@@ -1,4 +1,4 @@
-"""The QTM driver against the conformance suite of drivers."""
+"""Conformance tests of the QTM driver."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""QTM packets to optical frames: names, units, axes, absence, time and order."""
+"""Decoder of QTM packets: names, units, axes, absence, time and order."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.drivers.qtm.feeder import (
 )
 
 QUARTER_TURN = (0.0, 1, 0, -1, 0, 0, 0, 0, 1)
-"""+90° about z, column-major."""
+"""Matrix of a rotation by +90° about z, column-major."""
 
 
 def test_positions_are_metres_and_matrices_are_column_major() -> None:

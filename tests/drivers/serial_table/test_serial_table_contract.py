@@ -1,4 +1,4 @@
-"""The serial-table driver against the conformance suite of drivers, one class per kind of table."""
+"""Conformance tests of the serial-table driver, one class per kind of table."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.real_time
 
 
 class ChattyDevice:
-    """A device that sends text of another kind, without being asked."""
+    """A device of another kind that sends text without a request."""
 
     def __init__(self, link: Path) -> None:
         self._line = PtyLine(link)
@@ -80,5 +80,5 @@ class TestLinesOfAnArduino(TestIntegersInFixedFrames):
     table = CSV
     faults: ClassVar[dict[str, Any]] = {}
 
-    # Without a checksum a changed digit is a number, too.
+    # The lines have no checksum, so a changed digit is not detected.
     test_line_noise_affects_only_damaged_samples = None  # type: ignore[assignment]

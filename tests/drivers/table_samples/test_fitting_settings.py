@@ -1,4 +1,4 @@
-"""Wrong byte order, type, scale and units of a table are found from the data, with the remedy."""
+"""Warnings about wrong byte order, type, scale and units of a table, found from the data."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ RAW: dict[str, Any] = {
 
 
 class MemoryPort:
-    """Stores what a device sends."""
+    """Port that stores the messages of a device."""
 
     is_open, line_ns = True, 0
 

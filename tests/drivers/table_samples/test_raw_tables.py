@@ -1,4 +1,4 @@
-"""Raw readings by table: the gateway computes the orientation, with and without device time."""
+"""Orientations of raw readings that a table describes, with and without device time."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ NODE: dict[str, Any] = {
 
 
 def turning(number: int) -> Quaternion:
-    """Return an orientation that rests for two seconds, and then rolls to and fro."""
+    """Return the orientation of reading `number`: two seconds of rest, then oscillation about x."""
     roll = 0.6 * math.sin(2.0 * max(number - 200, 0) * 0.01)
     return (math.cos(roll / 2), math.sin(roll / 2), 0.0, 0.0)
 

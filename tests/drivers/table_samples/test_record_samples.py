@@ -1,4 +1,4 @@
-"""Samples from records: canonical frames, losses, restarts, corrupt and invalid values."""
+"""Samples from records: canonical orientations, losses, restarts, corrupt and invalid values."""
 
 from __future__ import annotations
 

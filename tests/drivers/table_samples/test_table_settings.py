@@ -338,7 +338,8 @@ PAGES += "".join(
     )
     for signal in signals.split()
 )
-"""Frames with one identifier. PAGE selects their content; Q0 and Q1 are on pages of a page."""
+"""DBC file of frames with one identifier. The multiplexer PAGE selects their content. The nested
+multiplexer TEMPERATURE selects Q0 or Q1."""
 RAW_SIGNALS = {
     "rate": {"signals": ["WX", "WY", "WZ"]},
     "acceleration": {"signals": ["AX", "AY", "AZ"]},

@@ -1,4 +1,4 @@
-"""The VectorNav driver against the conformance suite of drivers."""
+"""Conformance tests of the VectorNav driver."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.real_time
 
 
 class TestVectorNav(DriverContract):
-    """Factory settings: ASCII output on, no binary output."""
+    """The device has factory settings: it sends ASCII output and no binary output."""
 
     registered_as = "vectornav"
 
@@ -57,7 +57,7 @@ class TestVectorNavThatStreamsFromTheStart(TestVectorNav):
 
 @pytest.mark.skipif(find_spec("vqf") is None, reason="the extra vqf is not installed")
 class TestVectorNavWithRawMeasurements(TestVectorNav):
-    """Raw measurements on the wire, orientation on the gateway."""
+    """The device sends raw measurements, and the gateway computes the orientation."""
 
     has_history = True
 

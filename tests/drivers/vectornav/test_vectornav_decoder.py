@@ -1,4 +1,4 @@
-"""Messages of VectorNav devices to samples: time, frames, registers and faults."""
+"""Decoder of VectorNav devices: time, coordinate frames, registers and faults."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The VectorNav handshake against simulated devices with every setting and fault."""
+"""Handshake of the VectorNav driver with simulated devices, for every setting and fault."""
 
 from __future__ import annotations
 

@@ -24,14 +24,14 @@ def settings(folder: Path | None = None, **more: Any) -> VectorNavSettings:
 
 
 def output(t_ns: int | None, q: tuple[float, ...] = NATIVE) -> bytes:
-    """Return a binary output with an orientation; without time if it is None."""
+    """Return a binary output with an orientation; without a time field if `t_ns` is None."""
     w, x, y, z = q
     time = {} if t_ns is None else {int(Field.TIME_STARTUP): (t_ns,)}
     return encode_binary({**time, int(Field.QUATERNION): (x, y, z, w)})
 
 
 def decoded(messages: list[bytes], **more: Any) -> list[Decoded]:
-    """Decode messages that arrive one period after the other."""
+    """Return the output of a decoder for messages that arrive at intervals of one period."""
     decoder = VectorNavImu(settings(**more)).decoder()
     found = [
         event

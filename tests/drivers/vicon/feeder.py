@@ -11,7 +11,7 @@ from jointfit_protocols.vicon import ObjectId
 
 UNTURNED = (1.0, 0, 0, 0, 1, 0, 0, 0, 1)
 PERIOD = 1_350_000
-"""Ticks of a frame at 100 Hz."""
+"""Period of the frames at 100 Hz, ticks."""
 
 
 def prop(number: int, name: str, *markers: str) -> vicon.SubjectInfo:

@@ -1,4 +1,4 @@
-"""The Vicon driver against the conformance suite of drivers."""
+"""Conformance tests of the Vicon driver."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Vicon packets to optical frames: names, units, axes, absence, state, time and latency."""
+"""Decoder of Vicon packets: names, units, axes, absence, state, time and latency."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.drivers.vicon.feeder import (
 )
 
 QUARTER_TURN = (0.0, -1, 0, 1, 0, 0, 0, 0, 1)
-"""+90° about z, row-major."""
+"""Matrix of a rotation by +90° about z, row-major."""
 
 
 def test_positions_are_metres_and_matrices_are_row_major() -> None:

@@ -1,4 +1,4 @@
-"""The VRPN driver against the conformance suite of drivers, in every form of connection."""
+"""Conformance tests of the VRPN driver, in every form of connection."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ def test_the_bodies_of_one_instant_are_one_frame() -> None:
     frames = feeder.play(range(20), 1, 2, 3)
     assert all(seen(frame) == {"Thigh", "Shank", "Foot"} for frame in frames)
     assert [frame.ticks for frame in frames] == [T0_US + n * PERIOD_US for n in range(20)]
-    assert frames[-1].arrival_ns == (T0_US + 19 * PERIOD_US) * 1000  # no frame of delay
+    assert frames[-1].arrival_ns == (T0_US + 19 * PERIOD_US) * 1000  # not delayed by a frame
 
 
 def test_a_body_without_a_report_is_absent_and_delays_no_frame_for_long() -> None:
@@ -108,7 +108,7 @@ def test_a_stall_of_the_server_costs_no_report() -> None:
 
 
 def test_frames_sent_in_bursts_remain_whole() -> None:
-    """A busy server makes the messages of late frames at nearly the same time."""
+    """A busy server stamps the messages of late frames with nearly the same time."""
     feeder = Feeder()
     t_us = T0_US
     for n in range(300):

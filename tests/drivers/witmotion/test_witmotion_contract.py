@@ -1,4 +1,4 @@
-"""The WitMotion driver against the conformance suite of drivers."""
+"""Conformance tests of the WitMotion driver."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def settings(folder: Path, **more: Any) -> WitMotionSettings:
 
 
 class TestWitMotion(DriverContract):
-    """A device as the factory sends it: slow and without quaternions."""
+    """A device with factory settings sends at a low rate and without quaternions."""
 
     registered_as = "witmotion"
 
@@ -52,7 +52,7 @@ class TestWitMotion(DriverContract):
 
 
 class TestWitMotionWithDeviceTime(TestWitMotion):
-    """A configured device that answers no reads, with its calendar time, in another world."""
+    """A configured device answers no read commands, sends its time, and uses another world."""
 
     @override
     def make_device(self, folder: Path, wire_noise: WireNoise) -> WitMotionDevice:
@@ -70,7 +70,7 @@ class TestWitMotionWithDeviceTime(TestWitMotion):
 
 @pytest.mark.skipif(find_spec("vqf") is None, reason="the extra vqf is not installed")
 class TestWitMotionRaw(TestWitMotion):
-    """Raw readings on the wire, orientation on the gateway."""
+    """The device sends raw readings, and the gateway computes the orientation."""
 
     @override
     def make_driver(self, folder: Path) -> Driver:

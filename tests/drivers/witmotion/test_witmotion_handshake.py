@@ -32,7 +32,7 @@ def device(folder: Path, **options: Any) -> WitMotionDevice:
 
 
 async def start(folder: Path, imu: WitMotionDevice, **more: Any) -> None:
-    """Run the driver until ten samples arrived."""
+    """Run the driver until ten samples have arrived."""
     async with serving(imu, feeding=True):
         run = DriverRun(make(folder, **more))
         await run.wait_for(10)

@@ -1,4 +1,4 @@
-"""The Xbus driver against the conformance suite of drivers."""
+"""Conformance tests of the Xbus driver."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class TestXbus(DriverContract):
 
 
 class TestXbusThatStreamsFromTheStart(TestXbus):
-    """Mid-message bytes and old samples come first, as from a real device."""
+    """The device first sends the rest of a message and old samples, like a real device."""
 
     @override
     def make_device(self, folder: Path, wire_noise: WireNoise) -> XbusDevice:
@@ -70,7 +70,7 @@ RAW_OUTPUTS = (
 
 @pytest.mark.skipif(find_spec("vqf") is None, reason="the extra vqf is not installed")
 class TestXbusWithRawMeasurements(TestXbus):
-    """Raw readings on the wire, orientation on the gateway."""
+    """The device sends raw readings, and the gateway computes the orientation."""
 
     has_history = True
 

@@ -1,4 +1,4 @@
-"""The decoder of the Xbus driver: samples, stamps, gaps, restarts and gates."""
+"""The decoder of the Xbus driver: samples, stamps, gaps, restarts and checks."""
 
 from __future__ import annotations
 

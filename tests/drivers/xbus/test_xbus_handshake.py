@@ -222,7 +222,7 @@ async def test_a_device_that_acknowledges_after_a_second_and_a_half_comes_up(
             assert len(await chunks_of(make(folder))) >= 5
             assert device.asked == 1 or not streams, "one request at a time"
 
-    # Both wait for seconds, so they run together.
+    # Both cases wait for seconds, so they run concurrently.
     await asyncio.gather(
         comes_up(tmp_path_factory.mktemp("streaming"), streams=True),
         comes_up(tmp_path_factory.mktemp("silent"), streams=False),

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 vqf = pytest.importorskip("vqf")
 STILL = (0.0, 0.0, 0.0)
 UP = (0.0, 0.0, 9.81)
-TICKS = 100  # at 100 Hz
+TICKS = 100  # per sample at 100 Hz
 
 
 def setup(rate_hz: int = 100, **more: Any) -> XbusSettings:
@@ -91,7 +91,7 @@ def test_a_real_trial_through_the_driver_equals_the_package_run_directly(
     assert rotation.angle_between(said, direct).max() < 1e-12
     seen = np.isfinite(optical[:, 0]) & (np.arange(len(optical)) > 9 * 286)
     error = rotation.angle_between(said[seen], optical[seen])
-    assert np.rad2deg(np.sqrt(np.mean(error**2))) < goal_deg + 0.6  # only a minute to converge
+    assert np.rad2deg(np.sqrt(np.mean(error**2))) < goal_deg + 0.6  # the trial lasts a minute
 
 
 def test_the_interval_is_that_of_the_device_clock_and_not_the_nominal_one() -> None:
@@ -199,7 +199,7 @@ def test_a_filter_at_rest_settles_sooner() -> None:
 def test_heading_after_a_start_in_fast_motion_is_settled_with_the_inclination(
     shared_data: Path,
 ) -> None:
-    """Recorded board at 579 °/s RMS: RMS error of the first second with output, in 24 starts."""
+    """The RMS error of the first second of output is small in 24 starts at 579 °/s RMS."""
     with np.load(shared_data / "broad_excerpts" / "07_undisturbed_fast_rotation_B_60s.npz") as file:
         felt = [file[f"imu_{kind}"].astype(float).tolist() for kind in ("gyr", "acc", "mag")]
         optical = file["opt_quat"].astype(float)
@@ -215,7 +215,7 @@ def test_heading_after_a_start_in_fast_motion_is_settled_with_the_inclination(
         }
         off = rotation.angle_between(np.array([*found.values()]), optical[list(found)])
         errors.append(np.degrees(np.sqrt(np.mean(off**2))))
-    assert max(errors) < 6.0  # 7.1 if the field is used from the start on
+    assert max(errors) < 6.0  # 7.1° if the field is used from the start on
 
 
 def delayed_fields(delay_s: float, amplitude: float) -> tuple[np.ndarray, ...]:
@@ -265,7 +265,7 @@ def test_after_a_long_gap_in_fast_motion_the_sensor_is_silent_till_it_has_settle
 
 
 def test_a_fast_rate_that_repeats_itself_is_at_the_end_of_its_range() -> None:
-    """This also applies without a status word; a slow rate may repeat, a fast rate never does."""
+    """The repeated rate is detected without a status word. Slow rates may repeat."""
     fast = [(7.85398, 0.0, 0.0)] * 3 + [(7.0 + 0.01 * k, 0.1, 0.2) for k in range(30)]
     slow = [(1.0, 0.0, 0.0)] * 30
     for rates, expected in ((fast, 1), (slow, 0), (fast[3:], 0)):

@@ -1,4 +1,4 @@
-"""A recorded device, played into a real pty at its own timing, through the whole driver."""
+"""Recording of an Xbus device, replayed into a pty and read by the whole driver."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Player(XbusDevice):
         last = None
         for message in messages:
             items = dict(split(message.data) or [])
-            if Item.QUATERNION in items:  # the others have the time of another clock
+            if Item.QUATERNION in items:  # other messages have the time of another clock
                 ticks = decode_item(Item.SAMPLE_TIME_FINE, items[Item.SAMPLE_TIME_FINE])
                 assert isinstance(ticks, int)
                 if last is not None:

@@ -1,4 +1,4 @@
-"""The XCDI driver against the conformance suite of drivers, over SLCAN and in one process."""
+"""Conformance tests of the XCDI driver, over SLCAN and on an in-process bus."""
 
 from __future__ import annotations
 

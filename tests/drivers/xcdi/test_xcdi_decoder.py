@@ -387,7 +387,7 @@ def test_identifiers_left_out_move_with_their_block() -> None:
 
 @pytest.mark.parametrize("base", [-1, 0, 1, 0x7DE, 0x7DF, 0x7FE])
 def test_derived_identifiers_never_leave_the_range_of_the_given_ones(base: int) -> None:
-    """The quaternion has the largest identifier of the block, which is given and checked."""
+    """The quaternion has the largest identifier of the block. It is always given and checked."""
     ids = {"sample_time": base + 5, "group_counter": base + 6, "quaternion": base + 0x21}
     if base + 0x21 > 0x7FF:
         with pytest.raises(ValidationError, match="above 0x7FF, the greatest 11-bit identifier"):

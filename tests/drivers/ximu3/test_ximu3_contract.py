@@ -1,4 +1,4 @@
-"""The x-IMU3 driver against the conformance suite of drivers."""
+"""Conformance tests of the x-IMU3 driver."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class TestXImu3ThatIsListenedTo(TestXImu3):
 
 @pytest.mark.skipif(find_spec("vqf") is None, reason="the extra vqf is not installed")
 class TestXImu3WithOrientationOnTheGateway(TestXImu3):
-    """Raw values have no norm and no smooth course: without a checksum, noise changes them."""
+    """The messages have no checksum and raw values no fixed norm, so noise is not detected."""
 
     has_history = True
     has_noise = False

@@ -36,7 +36,7 @@ def decoder(**keys: Any) -> XImu3Decoder:
 
 
 def swing(number: float) -> Quaternion:
-    """Return a smooth motion with accelerations."""
+    """Return the orientation of sample `number` in a smooth motion with accelerations."""
     angle = 0.4 * math.sin(0.05 * number)
     return (math.cos(angle), 0.6 * math.sin(angle), 0.0, 0.8 * math.sin(angle))
 
@@ -339,7 +339,7 @@ def test_raw_messages_give_the_orientation_with_magnetic_heading() -> None:
         turning = rate if number else 0.0
         wires.append(encode_data("I", ticks, (0.0, 0.0, turning, 0.0, 0.0, 1.0)))
         if number % 5 == 0:
-            north = (math.sin(heading), math.cos(heading))  # of x = east: sensor x at the heading
+            north = (math.sin(heading), math.cos(heading))  # sensor axes; x is east at heading 0
             wires[-1] = encode_data("M", ticks, (0.4 * north[0], 0.4 * north[1], -0.9)) + wires[-1]
     found = samples(fed(subject, *wires))
     assert len(found) > 500

@@ -1,4 +1,4 @@
-"""The x-IMU3 handshake against simulated devices with right, wrong and missing settings."""
+"""Handshake of the x-IMU3 driver with devices that have right, wrong and missing settings."""
 
 from __future__ import annotations
 

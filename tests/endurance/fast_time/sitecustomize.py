@@ -1,8 +1,8 @@
 """Accelerates the time of a daemon process; Python imports this module at its start.
 
-ENDURANCE is the path of a file, the factor, and the instant at which both times agree, ns of
-CLOCK_MONOTONIC. The file receives the numbers of asyncio tasks, of Python objects and of bytes that
-malloc has allocated.
+The environment variable ENDURANCE contains the path of a file, the factor, and the instant at
+which accelerated and real time agree, ns of CLOCK_MONOTONIC. The file receives the numbers of
+asyncio tasks, of Python objects and of bytes that malloc has allocated.
 """
 
 import asyncio

@@ -1,7 +1,8 @@
 """Faults of the host in a daemon process: Python imports this module at its start.
 
 A real step of UNIX time would reach every process of the machine, and a slow disk needs a device
-of its own. The file that INJECTED_FAULTS names has the step, ns, and the delay of a write, s.
+of its own. The environment variable INJECTED_FAULTS names a file with the step of UNIX time, ns,
+and the delay of a durable write, s.
 """
 
 import mmap

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 async def run(gateway: Gateway) -> Outcome:
-    """Replace the broker by a mosquitto with an access list without right to write."""
+    """Replace the broker by a mosquitto whose access list permits no writing."""
     rights = gateway.folder / "denying.acl"
     rights.write_text("topic read #\n", "utf-8")
     rights.chmod(0o600)
@@ -21,7 +21,7 @@ async def run(gateway: Gateway) -> Outcome:
     with gateway.other_broker(denying):
         noticed_s = await gateway.logged("the broker refuses messages on", since)
     recovered_s = await gateway.used("S1", "S2")
-    # A topic leaves the list with its next message, and not every topic has one soon.
+    # A topic is in `denied` until its next message, and some topics have no message for long.
     health = gateway.listener.latest
     await gateway.seconds(lambda: "pose" not in health["bridge/health"]["link"]["denied"])
     return Outcome(noticed_s, recovered_s, 0.0, 0)

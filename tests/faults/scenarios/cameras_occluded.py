@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 async def run(gateway: Gateway) -> Outcome:
-    """Occlude a marker for two seconds, sent as zeros."""
+    """Occlude a marker for two seconds; the server sends it as zeros."""
     since, cameras = len(gateway.listener.poses), gateway.cameras
     before = await gateway.device("mocap")
     cameras.set_options(hiding="zeros")

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 async def run(gateway: Gateway) -> Outcome:
-    """Step the clock by an hour."""
+    """Step UNIX time back by an hour, and forward again."""
     return await step(gateway, -3600.0)
 
 

@@ -12,12 +12,12 @@ if TYPE_CHECKING:
 
 
 async def run(gateway: Gateway) -> Outcome:
-    """Step the clock by an hour."""
+    """Step UNIX time forward by an hour, and back again."""
     return await step(gateway, 3600.0)
 
 
 async def step(gateway: Gateway, seconds: float) -> Outcome:
-    """Step UNIX time, and step it back."""
+    """Step UNIX time by `seconds`, and undo the step; return the outcome."""
     since = len(gateway.listener.poses)
     before = (await gateway.health())["devices"]["S1"]
     gateway.inject(step_s=seconds)

@@ -34,7 +34,7 @@ async def run(gateway: Gateway) -> Outcome:
 
 
 def recording_fails(gateway: Gateway) -> Callable[[], object]:
-    """Return a test whether the recorder reports a failure."""
+    """Return a function that returns the failure that the recorder reports, if any."""
     return lambda: gateway.listener.latest["bridge/health"]["recording"]["failure"]
 
 

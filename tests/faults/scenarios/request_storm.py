@@ -24,7 +24,7 @@ REQUESTS = (
     ("unknown", b"[" * 5000),
     ("record", b"\\xff" * 300),
 )
-"""Topics and payloads."""
+"""Topic and payload of each request that is sent in turn."""
 
 
 async def run(gateway: Gateway) -> Outcome:

@@ -1,4 +1,4 @@
-"""An adapter delivers bytes every 16 ms."""
+"""A USB adapter delivers the samples of both sensors in pairs, every 20 ms."""
 
 from __future__ import annotations
 

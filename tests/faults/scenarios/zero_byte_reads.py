@@ -17,7 +17,7 @@ END = b"\x04"
 
 
 async def run(gateway: Gateway) -> Outcome:
-    """Switch the line discipline of S1 to lines and send ends of file."""
+    """Switch the port of S1 to line mode, and send the end-of-file character."""
     since, before = len(gateway.listener.poses), await gateway.device("S1")
     port = os.open(gateway.folder / "S1", os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     try:

@@ -1,4 +1,4 @@
-"""Bytes of TCP connections in captures: any segments, and packets of QTM and Vicon in them."""
+"""Captured TCP segments in any order become byte streams, and packets of QTM and Vicon."""
 
 from __future__ import annotations
 

@@ -30,7 +30,10 @@ NAMES = ("Tom:LASI", "Tom:RASI", "Tom:LKNE")
 
 
 def write_c3d(path: Path, positions: NDArray[np.float64], **parameters: Any) -> None:
-    """Write positions (n, k, 3), NaN missing, with ezc3d."""
+    """Write positions, shape (n, k, 3), NaN where missing, with ezc3d.
+
+    `units` is mm by default. Other `parameters` become parameters of the group POINT.
+    """
     file = ezc3d.c3d()
     points = file["parameters"]["POINT"]
     points["RATE"]["value"] = [200.0]
@@ -87,7 +90,7 @@ def test_residuals_of_the_cameras_are_read_in_metres(
     write_c3d(path, np.nan_to_num(positions))
     assert read_marker_trial(path).residuals(["RASI"]) is None
     residuals = np.random.default_rng(2).integers(1, 200, (40, 3)).astype(np.float32)
-    residuals[7, 2] = 0.0  # interpolated
+    residuals[7, 2] = 0.0  # the residual of an interpolated point
     content = bytearray(path.read_bytes())
     begin = (int.from_bytes(content[16:18], "little") - 1) * 512
     cells = np.frombuffer(content, "<f4", 40 * 3 * 4, begin).reshape(40, 3, 4)

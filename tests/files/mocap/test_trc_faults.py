@@ -1,4 +1,4 @@
-"""TRC files that are cut off, or are no TRC files."""
+"""Truncated TRC files and files of other formats are rejected with the cause and a remedy."""
 
 from __future__ import annotations
 

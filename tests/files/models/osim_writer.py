@@ -76,7 +76,7 @@ def joint(h: Hung) -> str:
 
 
 def write_osim(path: Path, hung: list[Hung], markers: list[tuple[str, str, Triple, bool]]) -> Path:
-    """Write a model; markers are name, body, location, fixed."""
+    """Write a model; a marker consists of name, body, location, m, and whether it is fixed."""
     bodies = "".join(
         f"<Body name='{h.body}'><mass>1</mass><mass_center>0 0 0</mass_center>"
         "<inertia>0.1 0.1 0.1 0 0 0</inertia></Body>"

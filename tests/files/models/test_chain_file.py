@@ -1,4 +1,4 @@
-"""Chain models as TOML and JSON."""
+"""Chain models are written to TOML and JSON and read back; all faults of a file are reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Conversion of OpenSim models to chain models of the project."""
+"""OpenSim models become chain models with the same motion; faults and differences are reported."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ ROWS = 200
 
 
 def turns(rows: int, seed: int) -> Array:
-    """Return a smooth random rotation, with three unknown rows."""
+    """Return the quaternions of a smooth random rotation, of which three are unknown."""
     rng = np.random.default_rng(seed)
     q = Rotation.from_rotvec(np.cumsum(rng.normal(scale=0.02, size=(rows, 3)), axis=0))
     orientation = q.as_quat(scalar_first=True)

@@ -38,7 +38,7 @@ def time_axes(draw: st.DrawFn) -> Array:
 
 
 class _Drawing:
-    """Draws series; with `axis`, all share it."""
+    """Draws random series, which all have the times `axis` if this is given."""
 
     def __init__(self, draw: st.DrawFn, axis: Array | None, gaps: bool) -> None:
         self.draw, self._axis, self._gaps = draw, axis, gaps
@@ -112,7 +112,7 @@ class _Drawing:
 
 @st.composite
 def session_data(draw: st.DrawFn, *, axis: Array | None = None, gaps: bool = True) -> SessionData:
-    """Return a session; with `axis`, all its series share it."""
+    """Return a random session, whose series all have the times `axis` if this is given."""
     drawing = _Drawing(draw, axis, gaps)
     return SessionData(
         "walk 1",
@@ -129,7 +129,7 @@ def session_data(draw: st.DrawFn, *, axis: Array | None = None, gaps: bool = Tru
 
 
 def known_rows(t_s: Array, values: Array) -> tuple[Array, Array]:
-    """Return the rows that are known, at least in part."""
+    """Return the times and values of the rows with at least one known value."""
     seen = ~np.isnan(values.reshape(len(values), -1)).all(axis=1)
     return t_s[seen], values[seen]
 
@@ -137,7 +137,7 @@ def known_rows(t_s: Array, values: Array) -> tuple[Array, Array]:
 def assert_same_series(
     found: Any, expected: Any, precision: float, *, time_s: float = 2e-9
 ) -> None:
-    """Compare two series; a missing row and an unknown one are the same."""
+    """Compare two series; a missing row is equal to a row of unknown values."""
     slots = type(expected).__slots__
     assert type(found) is type(expected)
     for name in slots:

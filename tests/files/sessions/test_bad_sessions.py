@@ -1,4 +1,4 @@
-"""Damaged, foreign and hostile files are refused by name; a failed export leaves nothing."""
+"""Damaged, foreign and hostile files are refused by name; a failed export writes no file."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 def refusal(path: Path) -> str:
-    """Return the message of the refusal of a file; empty if it is read."""
+    """Return the error message for a file; an empty text if the file can be read."""
     message = ""
     try:
         read_session(path)
@@ -219,7 +219,7 @@ DAMAGED_DATA_SETS: dict[str, tuple[str, str | None]] = {
     "expected name": ("*S1_channels.tsv", "a\tb\n"),
     "_channels.tsv": ("*S1_channels.tsv", None),
 }
-"""Files to remove (None) or to replace, by words of the message."""
+"""Pattern and new content (None: removed) of files, by words of the expected message."""
 
 
 @pytest.mark.parametrize("words", DAMAGED_DATA_SETS)

@@ -93,7 +93,7 @@ def test_rates_and_increments_have_si_units(tmp_path: Path) -> None:
 def test_a_folder_of_synchronized_sensors_has_a_common_time(tmp_path: Path) -> None:
     q = np.tile([1.0, 0.0, 0.0, 0.0], (ROWS, 1))
     columns = "Quat_W,Quat_X,Quat_Y,Quat_Z"
-    # The time of the first file turns in the recording, that of the second begins after the turn.
+    # The 32-bit time of the first file wraps in the recording. The second file begins afterwards.
     written(tmp_path / "a.csv", columns, q, first=2**32 - 2 * PERIOD_US, tag="Thigh")
     written(tmp_path / "b.csv", columns, q, first=PERIOD_US, tag="Shank")
     thigh, shank = read_session(tmp_path).sensors

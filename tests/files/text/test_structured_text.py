@@ -1,4 +1,4 @@
-"""TOML and JSON files of any content: a value, or one clear fault."""
+"""Any content read as TOML or JSON yields a value, or one `MalformedFileError` with its cause."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""TRC, STO, MOT and NPZ: real files give the counts of their READMEs, written ones are read."""
+"""Real TRC, STO, MOT and NPZ files have the sizes in their READMEs; written files are read back."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ def play(
 def healthy(
     calibration: Calibration, walk: tuple[Array, dict[str, Array], dict[str, Array]]
 ) -> tuple[list[LimbState], list[tuple[float, str, str]]]:
-    """Return states and reports of the walk, which also contain those of a shorter walk."""
+    """Return states and reports of the walk without a fault."""
     t_s, measured, _ = walk
     return play(LimbFuser(CHAIN, calibration), t_s, measured)
 
@@ -232,7 +232,8 @@ def test_the_number_of_compared_pairs_grows_with_that_of_the_sensors() -> None:
     groups = [[f"S{i}" for i in range(count)] for count in (2, 5, 6, 16, 32)]
     assert [len(compared_pairs(group)) for group in groups] == [1, 10, 10, 30, 62]
     for group in groups[2:]:
-        for lost in (None, *group):  # each sensor has two others, even if one is lost
+        # Every sensor is in at least two pairs, even if one other sensor is lost.
+        for lost in (None, *group):
             partners = Counter(
                 n for pair in compared_pairs(group) if lost not in pair for n in pair
             )
@@ -304,7 +305,8 @@ def test_reload_preserves_drift_corrections(
     fuser, same = LimbFuser(CHAIN, calibration), LimbFuser(CHAIN, calibration)
     for each in (fuser, same):
         play(each, t_s[half], {name: q[half] for name, q in faulty.items()})
-    stored = Calibration.from_dict(calibration.to_dict())  # as if read from the store
+    # A calibration from the store is an equal object, but not the same object.
+    stored = Calibration.from_dict(calibration.to_dict())
     reloaded, fresh = LimbFuser(CHAIN, stored), LimbFuser(CHAIN, stored)
     reloaded.resume(fuser)
     left = {name: q[rest] for name, q in faulty.items()}
@@ -360,7 +362,7 @@ def test_unobserved_drift_increases_the_standard_deviation(
         grown = [s.segments[k].sd or 0.0 for s in (states[25], states[-1])]
         assert grown[1] > grown[0] + np.radians(2.0)
         assert (north[-1].segments[k].sd or 0.0) < grown[1]
-    assert states[-1].joints[1].angle_sd == north[-1].joints[1].angle_sd  # observable at the hinge
+    assert states[-1].joints[1].angle_sd == north[-1].joints[1].angle_sd  # observable by the hinge
     assert (states[-1].joints[2].position_sd or 0.0) >= (north[-1].joints[2].position_sd or 0.0)
     assert "heading_unseen" in states[-1].flags
     loose = tuple(link for link in calibration.links if link.kind == "pair")

@@ -13,7 +13,7 @@ S = 1_000_000_000
 def follow(
     rate_deg_min: float, *, seed: int, spread_deg: float = 3.0, seconds: int = 400
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return error and estimated standard deviation, deg, once a second.
+    """Return error and estimated standard deviation of the heading, deg, for every second.
 
     Half of the measurement variance is bias (soft tissue, correlation time 15 s), half is noise.
     """

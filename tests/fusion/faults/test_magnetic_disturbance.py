@@ -1,4 +1,4 @@
-"""Magnetic disturbances: which sensor is corrected, and which ambiguity remains."""
+"""Magnetic disturbances: correction of the disturbed sensors, and remaining uncertainty."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ UPDATE_NS = 40_000_000
 def detector_after(
     groups: tuple[tuple[str, ...], ...], off_deg: dict[str, float], seconds: float = 6.0
 ) -> MagneticDisturbanceDetector:
-    """Return a detector after headings deviated for the given time."""
+    """Return a detector after the headings of sensors deviated by `off_deg` for some seconds."""
     detector = MagneticDisturbanceDetector(groups)
     ways = [*(way for group in groups for way in pairwise(group))]
     ways += [(above[0], below[0]) for above, below in pairwise(groups)]
@@ -96,7 +96,7 @@ def test_corrections_start_and_end_without_a_jump() -> None:
     detector = detector_after(LEG, {"S2": 40.0})
     before, begin_ns = detector.corrections["S2"], 150 * UPDATE_NS
     for k in range(100):
-        detector.update(begin_ns + k * UPDATE_NS, [])  # no differences any more
+        detector.update(begin_ns + k * UPDATE_NS, [])  # no sensor pair has data
         now = detector.corrections.get("S2", 0.0)
         assert 0.0 <= before - now < 0.2 * 40.0 * DEG
         before = now

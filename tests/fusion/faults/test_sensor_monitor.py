@@ -53,7 +53,7 @@ def detection_time_ms(frames: Frames, inject: Callable[[Frames], Frames], name: 
 
 @pytest.mark.parametrize("behind", [1, 2, 3])
 def test_sensors_that_leave_a_noiseless_rest_some_frames_apart_are_not_stuck(behind: int) -> None:
-    # the other sensors repeat their last sample while theirs is delayed
+    # The samples of the other sensors are delayed, so these sensors seem to rest for longer.
     there = limb(6.0, noise_deg=0.0, speed=0.4)
     frames = there + [there[-1]] * 100 + there[::-1][:50]
     detector = StuckSensorDetector(GROUPS)

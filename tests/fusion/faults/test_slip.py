@@ -1,4 +1,4 @@
-"""Size and duration from which on a difference between two sensors of a segment is a fault."""
+"""Size and duration above which a difference between two sensors of a segment is a fault."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Chain models: validation and motion."""
+"""Chain models: rejection of invalid chains, Jacobian, steps and scaling."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.kinematics.chain_coordinates import hinge_angles
 
 
 def winding(rng: np.random.Generator, count: int = 12) -> tuple[Sample, ...]:
-    """Return samples of a segment that turns about all axes and shifts as one coordinate grows."""
+    """Return samples of a coupled joint that rotates about and translates along all axes."""
     amounts = np.linspace(-2.0, 2.5, count)
     ways = rng.normal(0.0, 0.5, (6, 3)) @ np.array([amounts, np.sin(amounts), amounts**2 / 4.0])
     turns = rotation.exp(ways[:3].T) * rng.choice([-1.0, 1.0], (count, 1))

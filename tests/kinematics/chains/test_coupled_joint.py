@@ -1,4 +1,4 @@
-"""Coupled joints: rotation and translation by one coordinate."""
+"""Coupled joints, whose rotation and translation depend on one coordinate."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ BENT = np.linspace(-0.3, 2.3, 40)
 
 
 def knee_pose(amounts: np.ndarray) -> tuple[Rotation, np.ndarray]:
-    """Return rotations and translations, m, of a knee that moves along and rotates with flexion."""
+    """Return rotations and translations, m, of a knee, as functions of its flexion."""
     a = np.asarray(amounts)
     turned = np.stack((-a, 0.2 * np.sin(a), 0.15 * (1.0 - np.cos(a))), axis=-1)
     shift = np.stack((0.002 * a, -0.02 * np.sin(a), 0.01 * a * a), axis=-1)

@@ -55,7 +55,7 @@ def test_values_and_standard_deviations_equal_those_of_the_table(seed: int) -> N
     covariance = root @ root.T
     table = coordinate_table(MODEL, state, covariance[None], COORDINATES)
     if np.abs(table.values[0, [1, 7]]).max() > 1.4:
-        return  # near a gimbal lock the angles amplify any difference
+        return  # near a gimbal lock, rounding errors of the pose cause large angle errors
     values, sd = CoordinateTracker(MODEL, COORDINATES).read(state, covariance)
     np.testing.assert_allclose(values, table.values[0], atol=RESOLUTION)
     np.testing.assert_allclose(sd, table.sd[0], rtol=5e-3)
@@ -98,11 +98,11 @@ def test_a_joint_of_two_angles_has_coordinates_although_noise_leaves_a_third() -
 
 
 MOST_STEPS = 8
-"""Numerical steps of an instant with one joint without closed form."""
+"""Largest number of numerical steps in one instant with one joint without closed form."""
 
 
 def sequence(name: str, axes: Array, is_free: bool = False) -> JointCoordinates:
-    """Return rotations about three own axes, and translations with an offset."""
+    """Return a joint with rotations about three axes and, if free, translations with an offset."""
     fixed = exp_matrix(np.array([0.2, -0.5, 0.9]))
 
     def pose(values: Array) -> tuple[Array, Array]:
@@ -170,7 +170,7 @@ def test_oblique_axes_are_inverted_in_few_steps_an_instant() -> None:
     assert thigh.pose is not None
     tracker = CoordinateTracker(BALL, (default_coordinates(BALL)[0], thigh))
     for k in range(60):
-        # One jump, for which the earlier values are no good start.
+        # At k = 31 the first angle jumps, so the earlier values are far from the solution.
         values = np.array([np.sin(0.1 * k) + 2.0 * (k > 30), 0.4 * np.cos(0.2 * k), 0.05 * k - 2.0])
         A = thigh.pose(values[None])[0][0]
         calls[0] = 0
@@ -182,7 +182,7 @@ def test_oblique_axes_are_inverted_in_few_steps_an_instant() -> None:
 
 
 def test_a_search_without_result_takes_few_steps_an_instant_until_it_ends() -> None:
-    # two angles cannot describe a rotation about the third axis
+    # The joint has two angles, which cannot describe a rotation about the third axis.
     calls, covariance = [0], 1e-4 * np.eye(9)
     both = sequence("thigh", np.eye(3)).pose
     assert both is not None
@@ -208,7 +208,7 @@ def test_a_search_without_result_takes_few_steps_an_instant_until_it_ends() -> N
 def test_angles_pass_a_gimbal_lock_without_a_jump() -> None:
     tracker, last = CoordinateTracker(BALL, COORDINATES[:2]), None
     for k in range(101):
-        second = 0.5 * np.pi - 0.02 + 4e-4 * k  # to the lock and beyond
+        second = 0.5 * np.pi - 0.02 + 4e-4 * k  # the angle increases to the gimbal lock and beyond
         A = exp_matrix(np.array([0.3, 0.0, 0.0])) @ exp_matrix(np.array([0.0, second, 0.0]))
         values, _ = tracker.read(ball_state(A), 1e-4 * np.eye(9))
         if k <= 50:

@@ -33,7 +33,10 @@ OPTIONS = IkOptions(limit_m2=1.0)
 
 
 def chain() -> ChainModel:
-    """Return two hinges with one marker beyond them: its elbow has a second, forbidden side."""
+    """Return a chain of two hinges with one marker on the last segment.
+
+    The elbow can bend to two sides with the same marker position; the limits forbid one side.
+    """
     rng = np.random.default_rng(0)
     segments = (
         Segment("base"),
@@ -54,7 +57,7 @@ def trial(count: int = 40) -> Array:
 
 
 def stuck(at: slice) -> tuple[IkResult, IkResult]:
-    """Return the right solution, and one that ends far from the minimum at some instants."""
+    """Return the correct solution, and a solution that is far from the minimum at instants `at`."""
     model, y = chain(), trial()
     right = solve_frames(model, y, options=OPTIONS)
     step = np.zeros((len(y), model.nq))

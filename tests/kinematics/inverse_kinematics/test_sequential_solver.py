@@ -1,4 +1,4 @@
-"""Poses from markers, one instant at a time."""
+"""Poses from markers by the sequential solver, which solves one instant at a time."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_undetermined_joints_are_held_reported_and_uncertain() -> None:
     model = limb()
     truth = swing(model)
     y = marker_positions(model, truth)
-    y[50:55, 5:] = np.nan  # one marker left on the shank
+    y[50:55, 5:] = np.nan  # only one marker of the shank is visible
     poses = followed(model, y)
     assert [i for i, p in enumerate(poses) if p.underdetermined] == list(range(50, 55))
     off = step_between(model, truth, joined(poses))
@@ -163,7 +163,7 @@ def test_another_number_of_markers_is_refused() -> None:
 
 
 def hostile(y: np.ndarray) -> dict[str, np.ndarray]:
-    """Return faulty markers: they jump, are exchanged or hidden, or belong to another model."""
+    """Return several versions of the markers `y` with faults, by name of the fault."""
     rng = np.random.default_rng(7)
     hidden, part, stray = y.copy(), y.copy(), y.copy()
     hidden[20:30] = np.nan

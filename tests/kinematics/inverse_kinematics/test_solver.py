@@ -1,4 +1,4 @@
-"""Poses from markers: all instants at once."""
+"""Poses from markers by the solver for whole trials, which solves all instants at once."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ COUNT = 40
 
 
 def leg(seed: int = 0, per_segment: int = 4) -> ChainModel:
-    """Return pelvis, thigh (ball), shank (hinge) and foot (ball) with markers all round."""
+    """Return pelvis, thigh (ball), shank (hinge) and foot (ball), with markers on all sides."""
     rng = np.random.default_rng(seed)
     segments = (
         Segment("pelvis"),
@@ -67,7 +67,7 @@ def leg(seed: int = 0, per_segment: int = 4) -> ChainModel:
 
 
 def walk(model: ChainModel, count: int = COUNT, heading: float = 2.5) -> ChainState:
-    """Return a smooth movement, the whole body turned by `heading`."""
+    """Return a smooth movement in which the whole body is rotated by `heading`, rad."""
     phase = np.linspace(0.0, 2.0 * np.pi, count)
     step = np.zeros((count, model.nq))
     step[:, 2] = heading
@@ -112,7 +112,8 @@ def test_true_markers_determine_the_pose_without_a_start(heading: float) -> None
 
 
 def test_an_instant_without_a_better_step_has_not_converged() -> None:
-    # The markers pull the knee beyond half a turn, where the excess over its limit jumps upwards.
+    # The markers require a knee rotation beyond 180 degrees, where the excess over the limit of
+    # the knee jumps to a larger value.
     model, count = leg(), 20
     step, begin = np.zeros((2, count, model.nq))
     step[:, 9], begin[:, 9] = -4.0, np.linspace(-3.1, -2.4, count)
@@ -157,7 +158,7 @@ def test_underdetermined_instants_follow_the_one_before() -> None:
     model = leg()
     truth = walk(model)
     y = marker_positions(model, truth)
-    y[10:14, 13:16] = np.nan  # one marker of the foot is left: it may turn about a line
+    y[10:14, 13:16] = np.nan  # the foot has one marker, and may rotate about a line
     y[0, 13:16] = np.nan
     found = solve_frames(model, y)
     assert np.flatnonzero(found.underdetermined).tolist() == [0, 10, 11, 12, 13]

@@ -1,4 +1,4 @@
-"""The schemas of payloads and requests: complete, valid, and equal to page and document."""
+"""Schemas of payloads and requests: complete, valid, and equal to the documents in docs."""
 
 from __future__ import annotations
 

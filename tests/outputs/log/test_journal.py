@@ -1,4 +1,4 @@
-"""Journal handler: entries have fields, and other lines go to standard error."""
+"""Journal handler: entries have fields; entries that journald refuses go to standard error."""
 
 from __future__ import annotations
 

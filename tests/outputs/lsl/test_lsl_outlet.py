@@ -41,7 +41,7 @@ def frame(number: int, t_ns: int, *, known: bool = True) -> LimbState:
 
 
 class Received(NamedTuple):
-    """Received data, without an object of the library, so that its sockets are closed."""
+    """Received data without objects of the library, so that the library's sockets are closed."""
 
     rate_hz: float
     labels: list[str]
@@ -74,7 +74,7 @@ def send_and_receive(lsl: Any, instants_ns: list[int]) -> Received:
 
 @pytest.mark.system
 def test_a_receiver_gets_frames_with_instants_and_units(lsl: Any) -> None:
-    # Frames are older than their transmission, as after fusion with a lag.
+    # The instants of the frames are earlier than their transmission, as in the daemon.
     began_ns, began_s = time.monotonic_ns(), lsl.local_clock()
     instants_ns = [began_ns - 40_000_000 + 10_000_000 * k for k in range(1, 21)]
     found = send_and_receive(lsl, instants_ns)

@@ -98,7 +98,7 @@ def families_of(text: str) -> list[Any]:
 
 
 async def scrape(frames: FrameStatistics | None = None) -> dict[tuple[str, str], float]:
-    """Return the values by name and by the value of the last label."""
+    """Return the values by name of the metric and by value of the metric's last label."""
     async with serving(frames or FrameStatistics()) as address:
         status, text = await asyncio.to_thread(fetch, address)
     assert status == 200
@@ -178,7 +178,7 @@ async def test_the_histogram_counts_each_frame_once_in_its_bucket(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     frames, now_ns = FrameStatistics(), 10**9 * 3600
-    clock = SimpleNamespace(monotonic_ns=lambda: now_ns)  # fixed, as a pause changes the bucket
+    clock = SimpleNamespace(monotonic_ns=lambda: now_ns)  # fixed: a pause would change the bucket
     monkeypatch.setattr("jointfit_daemon.outputs.metrics._frame_statistics.time", clock)
     for latency_ms in (0, 7, 7, 2000):
         frames.output(FRAME._replace(completed_ns=now_ns - latency_ms * 1_000_000))

@@ -78,7 +78,7 @@ async def test_newer_daemon_waits_until_the_first_is_gone(
     async with contextlib.AsyncExitStack() as newer:
         async with daemon_link(port, version) as older:
             await until(lambda: older.connected)
-            await asyncio.sleep(2.2)  # longer than SHORT_S: the older daemon is established
+            await asyncio.sleep(2.2)  # longer than SHORT_S: the older daemon counts as established
 
             newcomer = await newer.enter_async_context(daemon_link(port, version))
             await until(lambda: bool(refusals(caplog)))
@@ -113,7 +113,7 @@ async def test_newer_daemon_publishes_nothing_and_leaves_the_first_connected(
         assert older.connects == 1
 
         # The retained state that the older daemon published earlier may arrive as well. With MQTT
-        # 3.1.1 the broker always sends it. With MQTT 5 only the embedded broker may send it, if it
+        # 3.1.1 the broker always sends it. With MQTT 5 only the embedded broker sends it, if it
         # stored the state during the subscription.
         reader, new = watcher.messages(), list[Incoming]()
         with contextlib.suppress(TimeoutError):
@@ -181,7 +181,10 @@ CONNACK, TAKEN_OVER = b"\x20\x03\x00\x00\x00", b"\xe0\x02\x8e\x00"
 
 @pytest.mark.usefixtures("unseen")
 async def test_takeover_reason_of_the_broker_suffices(caplog: pytest.LogCaptureFixture) -> None:
-    """Later releases of mosquitto send this reason; mosquitto 2.0.11 and iotcore send none."""
+    """The broker of this test sends a reason, as do releases of mosquitto after 2.0.11.
+
+    Mosquitto 2.0.11 and the embedded broker end the older connection without a reason.
+    """
     serving: list[asyncio.Task[None] | None] = []
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -284,7 +287,7 @@ def test_daemon_that_gave_way_does_so_again_after_a_restart_of_the_broker(gap_s:
     assert not other.suspects(3600.0, taken_over=False)
     assert not paused.suspects(3600.0, taken_over=False)
     paused.restart_count()
-    assert not other.suspects(0.0, taken_over=False)  # no broker
+    assert not other.suspects(0.0, taken_over=False)  # 0 s: the broker was not reached
     assert takeovers(other, gap_s + 0.01, 0.02, reason=False)[-1] == 1
     assert paused.suspects(0.1, taken_over=True)
 

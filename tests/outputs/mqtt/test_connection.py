@@ -81,7 +81,7 @@ async def test_a_socket_closed_before_its_turn_leaves_no_traceback_in_the_log(
 @pytest.mark.parametrize(
     ("error", "fault"),
     [
-        (aiomqtt.MqttCodeError(4), "connection was lost"),  # paho: not connected
+        (aiomqtt.MqttCodeError(4), "connection was lost"),  # paho's number of "not connected"
         (aiomqtt.MqttError("Operation timed out"), "does not answer in time"),
         (aiomqtt.MqttError("something else"), "something else"),
     ],
@@ -103,7 +103,7 @@ def test_a_connection_that_ended_without_a_reason_is_reported_as_lost() -> None:
 
 @contextlib.asynccontextmanager
 async def answering(connack: bytes) -> AsyncIterator[int]:
-    """Run a broker that sends this answer to every CONNECT; yield its port."""
+    """Run a broker that answers every CONNECT with `connack`; yield the port of the broker."""
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await reader.read(1000)
@@ -219,7 +219,7 @@ async def test_absent_broker_is_logged_once(caplog: pytest.LogCaptureFixture) ->
 
 
 async def test_stop_during_a_connection_loss_ends_the_publisher() -> None:
-    for n in range(60):  # the connection is refused within these milliseconds
+    for n in range(60):  # the connection is refused within the longest of these waits
         async with asyncio.timeout(2), running(Link(free_port())):
             await asyncio.sleep(0.0002 * n)
 
@@ -298,7 +298,7 @@ async def test_with_mqtt_5_stored_requests_are_not_sent(mosquitto: Broker) -> No
 
 async def test_with_mqtt_5_new_retained_request_is_not_executed(
     mosquitto: Broker,
-) -> None:  # "retain as published", which the embedded broker lacks
+) -> None:  # needs "retain as published", which the embedded broker does not have
     async with running(Link(mosquitto.port)) as link:
         await until(lambda: bool(link.publisher.health().confirmed))
         async with MqttConnection(settings(mosquitto.port)) as operator:
@@ -466,7 +466,7 @@ async def test_messages_after_a_transmission_are_acknowledged_without_the_delay_
 ) -> None:
     async with MqttConnection(settings(broker.port)) as connection:
         await connection.subscribe([f"{BASE}/#"])
-        for number in range(8):  # the kernel delays after a few exchanges in both directions
+        for number in range(8):  # the kernel delays acknowledgements after some exchanges
             await connection.publish(Outgoing(f"{BASE}/a", b"%d" % number, 1))
             await anext(connection.messages())
         sock: Any = connection._client._client.socket()

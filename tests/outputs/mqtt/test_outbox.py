@@ -95,7 +95,7 @@ async def test_unacknowledged_responses_and_events_are_sent_again_in_order() -> 
     outbox.event("bridge/event", b"4")
     outbox.requeue_state()
     assert [payload for _, payload, _ in await drain(outbox)] == [b"r", b"0", b"2", b"3", b"4"]
-    assert outbox.dropped == 1  # the pose
+    assert outbox.dropped == 1  # the pose was dropped
     assert not outbox.has_unsent
 
 
@@ -134,7 +134,7 @@ async def test_every_message_is_sent_waiting_or_counted_as_dropped(
             getattr(outbox, action)(topic, payload)
         elif outbox.queued:
             message, done = await outbox.next()
-            if action == "send":  # otherwise its acknowledgement never comes
+            if action == "send":  # otherwise the message is never acknowledged
                 done()
                 sent += not message.retain
     at_broker = {}

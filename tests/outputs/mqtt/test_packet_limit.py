@@ -55,7 +55,7 @@ def passed_on(sent: bytes, chunk: int, admit: Callable[[str, bool], bool] | None
         for start in range(0, len(sent), chunk):
             theirs.sendall(sent[start : start + chunk])
             idle = 0
-            while idle < 9:  # several packets beyond the limit are dropped per call
+            while idle < 9:  # one call drops only some of the packets
                 try:
                     found += limited.recv(1 if len(found) % 2 else 1000)
                 except BlockingIOError:
@@ -85,7 +85,7 @@ def test_exactly_the_admitted_messages_are_passed_on(
         asked.append((topic, retained))
         return topic.startswith("a") and not retained
 
-    other = packet(7, 0xD0)  # not a message, so always passed on
+    other = packet(7, 0xD0)  # not a PUBLISH packet, so it is always passed on
     arriving = passed = b""
     within: list[tuple[str, bool]] = []
     for topic, length, retained in sent:
@@ -136,7 +136,7 @@ async def test_ten_thousand_stored_messages_do_not_prevent_connecting(
     async with running(Link(mosquitto.port, version=version)) as link:
         await until(lambda: bool(link.publisher.health().confirmed), 30)
         assert link.publisher.connects == 1
-        if version == "3.1.1":  # MQTT 5 does not send them
+        if version == "3.1.1":  # with MQTT 5, the broker sends no retained requests
             await until(lambda: link.publisher.ignored_requests > 0)
     assert link.requests == []
 
@@ -248,7 +248,11 @@ async def poses(link: Link) -> AsyncIterator[None]:
 
 @contextlib.asynccontextmanager
 async def broken_broker(answer: bytes, *, reset: bool) -> AsyncIterator[tuple[int, list[float]]]:
-    """Yield the port of a server that answers CONNECT and closes; yield the times of this."""
+    """Run a server that answers CONNECT with `answer` and closes the connection.
+
+    Yield the port of the server, and the times of the connections, s. With `reset`, the server
+    resets each connection.
+    """
     tries: list[float] = []
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -33,12 +33,12 @@ class PacketCollector(Client):
 
     def __init__(self, protocol: int) -> None:
         super().__init__(CallbackAPIVersion.VERSION2, protocol=protocol)  # type: ignore[arg-type]
-        self._sock: Any = object()  # as if connected
+        self._sock: Any = object()  # any object, so that the client counts as connected
         self.packets: list[bytes] = []
 
     def _packet_queue(self, command: int, packet: Any, *rest: Any) -> Any:  # type: ignore[explicit-override]
         del command, rest
-        self._sock = None  # nothing to close
+        self._sock = None  # so that the client closes no socket
         self.packets.append(bytes(packet))
         return 0
 
@@ -106,7 +106,7 @@ async def test_messages_keep_their_order_and_bytes_when_the_socket_is_full() -> 
         for number, payload in enumerate(payloads):
             message = Outgoing("b/pose", payload, expiry_s=2)
             await connection.send(message, lambda _, number=number: accepted.append(number))  # type: ignore[misc]
-        assert accepted == [0]  # the second did not fit, and all others wait
+        assert accepted == [0]  # the second message did not fit, and all later messages wait
 
         await broker.read_up_to(payloads[-1])
     found, at = [], broker.received.index(b"b/pose") - 5

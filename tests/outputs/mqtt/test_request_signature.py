@@ -181,7 +181,7 @@ def test_daemon_accepts_signed_requests_and_refuses_others(
 ) -> None:
     good = asked(guard, sign_request(KEY, TOPIC, ASKED))
     assert isinstance(good, Request)
-    assert good.arguments == {"phase": "static", "force": False}  # no trace of the signature
+    assert good.arguments == {"phase": "static", "force": False}  # without the signature's keys
     refused = asked(guard, ASKED)
     assert isinstance(refused, Reply)
     assert refused.transaction == "a1"
@@ -213,7 +213,8 @@ def test_documented_shell_example_signs(tmp_path: Path) -> None:
         if "openssl dgst" in block
     )
     (tmp_path / "jointfitd.request-key").write_bytes(KEY + b"\n")
-    (tmp_path / "mosquitto_pub").write_text('#!/bin/sh\nprintf %s "$6"\n')  # -t T -q 1 -m TEXT
+    # The arguments are "-t TOPIC -q 1 -m TEXT".
+    (tmp_path / "mosquitto_pub").write_text('#!/bin/sh\nprintf %s "$6"\n')
     (tmp_path / "mosquitto_pub").chmod(0o755)
     done = subprocess.run(
         ["sh", "-ec", f'PATH="{tmp_path}:$PATH"\n{script}'],

@@ -45,7 +45,7 @@ request_key_file = "key"
 
 @pytest.fixture
 def broker(tmp_path: Path, start_mosquitto: Callable[[str], Broker]) -> Broker:
-    """Return a broker that accepts clients with the password only."""
+    """Return a broker that accepts only clients with the password."""
     program = shutil.which("mosquitto_passwd", path=MosquittoBroker.PATH)
     if program is None:
         pytest.skip(MOSQUITTO_MISSING)
@@ -67,7 +67,7 @@ def folder(tmp_path: Path, broker: Broker) -> Path:
 
 
 async def everything_published(broker: Broker, folder: Path) -> bytes:
-    """Return all topics and payloads until a health message, a request, and its answer."""
+    """Return all topics and payloads up to a health message and the answer to a request."""
     settings = MqttSettings(
         host="127.0.0.1", port=broker.port, base="jointfit/bench", username="jointfitd",
         password_file=str(folder / "password"), request_key_file=str(folder / "key"),
@@ -172,7 +172,7 @@ def test_world_readable_secret_is_reported(tmp_path: Path) -> None:
 async def test_plain_mqtt_to_another_machine_is_logged_at_every_start(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    assert security_warnings(MqttSettings(insecure=True)) == []  # on the same machine
+    assert security_warnings(MqttSettings(insecure=True)) == []  # the broker is on this machine
     settings = MqttSettings(host="broker.invalid", insecure=True, base="b")
     with caplog.at_level(logging.WARNING):
         link = asyncio.create_task(MqttPublisher(settings, Outbox("b/s"), lambda _: None).run())

@@ -52,14 +52,14 @@ def certificate(folder: Path, name: str, ca: str, names: str = HERE, days: int =
 
 @pytest.fixture(scope="module")
 def pki(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder of authorities and certificates."""
+    """Return a folder with certificates, and the authorities that signed them."""
     if shutil.which("openssl") is None:
         pytest.skip("openssl is not installed (Debian: apt install openssl)")
     folder = tmp_path_factory.mktemp("pki")
     authority(folder, "ours")
     authority(folder, "theirs")
     certificate(folder, "broker", "ours")
-    certificate(folder, "expired", "ours", days=0)  # expires as it is made
+    certificate(folder, "expired", "ours", days=0)  # expires at its creation
     certificate(folder, "elsewhere", "ours", names="DNS:broker.example,IP:192.0.2.7")
     certificate(folder, "daemon", "ours")
     certificate(folder, "stranger", "theirs")
@@ -70,7 +70,7 @@ def pki(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def broker(
     request: pytest.FixtureRequest, pki: Path, start_mosquitto: Callable[[str], Broker]
 ) -> Broker:
-    """Return a broker with the certificate that the test names, by default a good one."""
+    """Return a broker with the certificate that the test names, by default a valid certificate."""
     name, *more = getattr(request, "param", ("broker",))
     listener = f"cafile {pki}/ours.crt\ncertfile {pki}/{name}.crt\nkeyfile {pki}/{name}.key\n"
     return start_mosquitto(listener + "".join(f"{line}\n" for line in more))

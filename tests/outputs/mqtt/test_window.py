@@ -36,7 +36,7 @@ class AcknowledgingBroker:
     Parameters
     ----------
     receive_maximum
-        Number of unacknowledged messages that it announces.
+        Number of unacknowledged messages that the broker permits.
     """
 
     def __init__(self, receive_maximum: int) -> None:
@@ -109,7 +109,7 @@ async def test_window_is_that_of_the_broker_if_it_is_smaller(
         await asyncio.sleep(0.05)
         assert len(broker.topics) == expected
 
-        broker.acknowledge("1")  # in any order
+        broker.acknowledge("1")  # messages may be acknowledged in any order
         await until(lambda: len(broker.topics) == expected + 1)
         assert not sending.done()
         broker.acknowledge("0")
@@ -171,7 +171,8 @@ async def test_messages_of_a_topic_arrive_in_order_across_losses_of_the_connecti
         task.cancel()
         await asyncio.wait([task])
 
-    # A message without an acknowledgement is repeated; the first arrivals are complete and ordered.
+    # Messages without an acknowledgement are repeated. Without the repetitions, the received
+    # messages are complete and in order.
     assert link.connects == 2
     assert list(dict.fromkeys(received)) == list(range(200))
     assert len(received) <= 200 + WINDOW

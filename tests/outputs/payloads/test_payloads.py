@@ -1,4 +1,4 @@
-"""The payloads equal the payloads in docs/mqtt.md."""
+"""Encoded payloads equal the payloads in docs/mqtt.md."""
 
 from __future__ import annotations
 
@@ -170,7 +170,7 @@ def test_pose_payload_is_exact() -> None:
                 "flexion_deg_s": 120.0,
                 "adduction_deg_s": -3.0,
                 "rotation_deg_s": 0.0,
-                "patent": None,  # the shank is unknown
+                "patent": None,  # the orientation of the shank is unknown
             },
             "ankle": {"p_m": None, "sd_m": None},
         },
@@ -219,7 +219,7 @@ def test_unknown_joint_is_null() -> None:
     }  # fmt: skip
 
 
-@example(1.797693134862316e304)  # finite, but not in hundredths of a degree
+@example(1.797693134862316e304)  # finite in rad, but infinite in hundredths of a degree
 @given(st.floats(allow_nan=True, allow_infinity=True))
 def test_payload_contains_no_nan_or_infinity(value: float) -> None:
     joint = JointState("knee", (value, value, value), value, JointAngles(value, value, value))

@@ -1,4 +1,4 @@
-"""Units of the calibration quality on MQTT."""
+"""Conversion of the calibration quality to the units of MQTT, and its rounding."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Event
 
 BATCH = 500
-"""Events that are written at once."""
+"""Number of events that are written at once."""
 
 
 def write_recording(directory: Path, events: Iterable[Event], name: str = "rig") -> Path:

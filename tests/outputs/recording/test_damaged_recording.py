@@ -1,4 +1,4 @@
-"""Damage costs the damaged chunk and nothing else; any file is read in bounded memory."""
+"""Damage of a recording loses only the damaged chunk, and any file is read in bounded memory."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def recorded() -> tuple[bytes, tuple[ChunkBlock, ...]]:
 
 
 def content_of(data: bytes) -> tuple[list[Event], list[RecordingGap]]:
-    """Return the events and the gaps of a file, after they were also read from its clean copy."""
+    """Return the events and gaps of a file; check that its repaired copy contains the same."""
     with TemporaryDirectory() as name:
         path, clean = Path(name) / "damaged.mcap", Path(name) / "clean.mcap"
         path.write_bytes(data)

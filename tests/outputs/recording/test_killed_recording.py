@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).resolve().parents[3]
 LONGEST_LOSS_S = 1.0
 PROCESSES = 4
-"""Processes that record at the same time."""
+"""Number of processes that record at the same time."""
 
 
 class KilledRecording(NamedTuple):
@@ -72,7 +72,7 @@ def kill_one(folder: Path, after_s: float) -> KilledRecording:
 
 
 def kill_many(folder: Path, moments_s: Sequence[float]) -> list[KilledRecording]:
-    """Kill one process at each moment, some at a time."""
+    """Kill one process at each moment; `PROCESSES` of them run at the same time."""
     folders = [folder / str(number) for number in range(len(moments_s))]
     for one in folders:
         one.mkdir()
@@ -84,7 +84,7 @@ def kill_many(folder: Path, moments_s: Sequence[float]) -> list[KilledRecording]
 @pytest.mark.parametrize(
     "moments_s",
     [
-        # Far apart, so that a write every two seconds loses too much at one of them.
+        # If the recorder wrote only every two seconds, one of these kills would lose too much.
         pytest.param([0.3, 0.9, 1.8, 2.7], id="4"),
         pytest.param(
             [random.Random(number).uniform(0.02, 3.0) for number in range(100)], id="100",

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 LAST_NS = 2000
 SENSORS = 3
 PREFIX_BYTES = 9
-"""Bytes of opcode and length of a record."""
+"""Number of bytes of the opcode and the length of a record."""
 
 
 @pytest.fixture(scope="module")

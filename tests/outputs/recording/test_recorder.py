@@ -67,7 +67,7 @@ def test_rotated_files_are_one_recording(tmp_path: Path) -> None:
         assert list(recording.events()) == some
         assert recording.gaps() == []
 
-    files[0].unlink()  # the next file contains its initial state
+    files[0].unlink()  # the second file contains the state at its own start
     recording = open_recording(files[1])
     first, *rest = recording.events()
     assert isinstance(first, SourceOpened)
@@ -282,7 +282,7 @@ def test_a_disk_that_stays_full_causes_one_gap(
     assert "No space left" in gap.reason
     assert (health.failure, health.lost) == (None, gap.count)
     found = list(read_events(tmp_path))
-    restored = found.pop(gap.first_sequence)  # the state after the gap
+    restored = found.pop(gap.first_sequence)  # the event that restores the state after the gap
     assert isinstance(restored, SourceOpened)
     assert found == some[: gap.first_sequence] + some[500:]
 

@@ -139,7 +139,7 @@ class RecordingMachine(RuleBasedStateMachine):
             return await asyncio.gather(*(outcome(call()) for call in calls))
 
         answers = dict(zip(order, self.complete(all_at_once()), strict=True))
-        if order.index("stop") < order.index("start"):  # of two equal names, the last counts
+        if order.index("stop") < order.index("start"):  # both starts follow the stop
             started = not isinstance(answers["start"], OSError)
             assert self.recorder.health().active == started
         self.unsafe = []

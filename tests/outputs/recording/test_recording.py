@@ -125,7 +125,7 @@ async def test_recording_returns_events_and_states_in_order(tmp_path: Path) -> N
     while recorder.path is None or recorder._pending or recorder._writing.locked():
         await asyncio.sleep(_recorder.FLUSH_S / 5)
     unfinished = recorder.path
-    assert list(read_events(unfinished)) == given_events  # readable while it is written
+    assert list(read_events(unfinished)) == given_events  # a file in use is readable
     recorder.event(Tick(1000))
     writing.cancel()
     await asyncio.wait([writing])

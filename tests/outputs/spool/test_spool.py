@@ -1,4 +1,4 @@
-"""The spool stores what an outage would lose, and delivers it once in order."""
+"""The spool stores the messages that an outage would lose, and delivers each once, in order."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ async def test_messages_of_an_outage_are_delivered_after_a_restart(tmp_path: Pat
         await asyncio.sleep(0.1)
         add(spool, numbers(0, 50))
         await until(lambda: spool.health().stored_bytes)
-        add(spool, numbers(50, 60))  # the end of the daemon writes them
+        add(spool, numbers(50, 60))  # the daemon writes these messages when it ends
     assert link.accepted == []
 
     link = FakeLink()

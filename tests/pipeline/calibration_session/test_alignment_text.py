@@ -1,4 +1,4 @@
-"""The text after the align phase shows a sensor that moved on the plate, or has no lag."""
+"""The status text after the align phase names sensors that moved on the plate or have no lag."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ def feed(
     sensors: tuple[str, ...] = SENSORS,
     cameras: bool = True,
 ) -> list[Output]:
-    """Send samples of sensors at 50 Hz, which turn at `speed` rad/s, and mocap frames."""
+    """Send samples at 50 Hz of sensors that turn at `speed` rad/s, and mocap frames."""
     out: list[Output] = []
     for k in range(round(start_s * 50), round(end_s * 50)):
         t_ns = k * SECOND // 50
@@ -195,7 +195,7 @@ def test_worse_calibration_is_rejected_with_the_reason() -> None:
     (status,) = only(outputs, CalibrationStatus)
     assert "knee 3.0" in status.text
     assert (status.level, status.kept) == ("warning", "knee 3.0 against 1.0 deg")
-    assert not only(outputs, Notice)  # the status is also an event
+    assert not only(outputs, Notice)  # no notice, because the status is also published as an event
 
 
 def test_job_contains_the_alignment_of_the_session() -> None:
@@ -358,7 +358,8 @@ def test_status_names_the_phases_whose_results_the_movement_uses() -> None:
     (status,) = only(ask(one, 11 * SECOND, "align"), CalibrationStatus)
     assert status.done == ("static",)
     outputs = feed(one, 11, 17)
-    assert only(outputs, CalibrationStatus)[-1].done == ("static",)  # the fit runs
+    # The fit of the align phase is still running.
+    assert only(outputs, CalibrationStatus)[-1].done == ("static",)
     (status,) = only(done(one, only(outputs, FitJob)[0], alignment=NO_WORLDS), CalibrationStatus)
     assert status.done == ("align", "static")
     (status,) = only(ask(one, 18 * SECOND, "static"), CalibrationStatus)

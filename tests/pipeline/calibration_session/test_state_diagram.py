@@ -21,7 +21,7 @@ IDLE = "idle"
 
 
 def diagram() -> str:
-    """Return the transitions as text, one line each; all idle phases are one."""
+    """Return the transitions as text, one line each; all idle phases are shown as one phase."""
     rows = dict.fromkeys(
         (IDLE if phase in RESTING else str(phase), str(event), str(after))
         for (phase, event), after in TRANSITIONS.items()

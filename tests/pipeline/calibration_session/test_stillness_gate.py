@@ -1,4 +1,4 @@
-"""The end of a stillness is reported once."""
+"""Stillness gate: the end of a still period is reported once."""
 
 from __future__ import annotations
 

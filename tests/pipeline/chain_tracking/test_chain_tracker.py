@@ -49,7 +49,7 @@ def angles(t_s: float) -> tuple[float, float]:
 
 
 def markers(t_s: float) -> Array:
-    """Return the markers from SciPy's rotations alone, m, shape (16, 3), in the order of NAMES."""
+    """Return markers computed with SciPy's rotations, m, shape (16, 3), in the order of NAMES."""
     hip, knee = angles(t_s)
     pelvis = Rotation.from_euler("z", 40.0 + 5.0 * t_s, degrees=True)
     thigh = pelvis * Rotation.from_euler("XYZ", (hip, 5.0, -3.0), degrees=True)
@@ -164,7 +164,7 @@ def test_three_exchanged_labels_are_named_together_each_with_its_place(
     rows = [NAMES.index(name) for name in labels]
 
     def rotate(_: float, points: Array) -> Array:
-        points[rows] = points[rows[1:] + rows[:1]]  # each label at the place of the next
+        points[rows] = points[rows[1:] + rows[:1]]  # each label is at the next label's place
         return points
 
     states, (notice,) = track(3.0, rotate)

@@ -1,4 +1,4 @@
-"""Online learning: selection of frames, outcome of refits, reversal."""
+"""Online learning: selection of frames, outcome of refits, and reversion."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def collector(*, wanted: bool = True, **changed: Any) -> OnlineFrameCollector:
 
 
 def feed(one: OnlineFrameCollector, seconds: float, begin_s: float = 0.0, **how: Any) -> None:
-    """Feed sensors at 100 Hz that turn by 1 rad/s, and mocap frames at 100 Hz between them."""
+    """Feed samples of sensors that turn at 1 rad/s, and mocap frames in between, at 100 Hz each."""
     flags, hidden = how.pop("flags", ()), how.pop("hidden", False)
     speed, cameras = how.pop("speed", 1.0), how.pop("cameras", True)
     for k in range(round(begin_s * 100), round((begin_s + seconds) * 100)):

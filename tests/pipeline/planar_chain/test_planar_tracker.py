@@ -1,4 +1,4 @@
-"""A planar chain with one marker on each end and two on inner segments is followed live."""
+"""Planar tracker: a chain with one marker on each end segment and two on each inner segment."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CHAIN = Chain(
 )  # fmt: skip
 MARKERS = {"pelvis": ("P1",), "thigh": ("T1", "T4"), "shank": ("C1", "C4"), "foot": ("F1",)}
 NAMES = ("P1", "T1", "T4", "C1", "C4", "F1")
-LOCAL = {  # in the plane: forward, up; from the proximal joint of the segment, m
+LOCAL = {  # m; forward and up in the plane, from the proximal joint of the segment
     "P1": (-0.08, 0.12), "T1": (0.06, -0.12), "T4": (-0.05, -0.31), "C1": (0.05, -0.08),
     "C4": (-0.04, -0.29), "F1": (0.13, -0.05),
 }  # fmt: skip
@@ -89,7 +89,7 @@ def track(
 
 
 def errors_m(figure: StickFigure, name: str) -> float:
-    """Return the distance of a joint from the true one within the plane, m."""
+    """Return the distance of a joint from its true position within the plane, m."""
     joint = next(joint for joint in figure.joints if joint.name == name)
     assert joint.position is not None, joint.refused
     true = in_space(flat(figure.t_ns / 1e9)[0][name], 0.0)
@@ -142,7 +142,7 @@ def test_joint_of_one_side_is_unknown_while_a_marker_is_missing() -> None:
         hip, knee, ankle = figure.joints
         assert hip.position is None  # the pelvis has one marker
         assert hip.refused == "thigh: T4 not visible"
-        assert knee.position is not None  # from the shank
+        assert knee.position is not None  # estimated from the shank alone
         assert errors_m(figure, "knee") < 0.006
         assert ankle.position is not None
         assert figure.sticks[1].ends[0] is None
@@ -152,7 +152,7 @@ def test_joint_of_one_side_is_unknown_while_a_marker_is_missing() -> None:
 
 def test_end_marker_is_needed_for_its_end_of_the_stick_only() -> None:
     figures, _ = track(11.0, hide("F1", 10.0, 11.0))
-    assert errors_m(figures[-1], "ankle") < 0.004  # from the shank and the center found before
+    assert errors_m(figures[-1], "ankle") < 0.004  # from the shank and the earlier center
     assert figures[-1].sticks[3].ends[1] is None
 
 

@@ -1,4 +1,4 @@
-"""A sensor with another serial number than the calibrated one is reported."""
+"""A sensor whose serial number differs from that of the calibrated sensor is reported."""
 
 from __future__ import annotations
 

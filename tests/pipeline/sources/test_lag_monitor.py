@@ -99,7 +99,7 @@ def test_lag_is_estimated_during_movement() -> None:
     assert play(monitor, 16.0, 7.3) == []
     found = lag_payload(monitor.health()["S1"])
     assert found["lag_source"] == "calibration"
-    assert found["lag_ms"] == 2.0  # in use: the estimate is not applied
+    assert found["lag_ms"] == 2.0  # the lag of the calibration stays in use
     assert (found["lag_sigma_ms"], found["lag_found_by"]) == (0.2, "plate and movement")
     assert found["tracked_ms"] == pytest.approx(7.3, abs=0.1)
     assert found["tracked_refused"] is None
@@ -111,7 +111,8 @@ def test_orientations_of_overlapping_windows_equal_those_fitted_anew() -> None:
     monitor = LagMonitor(CHAIN, CALIBRATION)
     play(monitor, 24.0, 4.0)
     track = monitor._tracks["thigh"]
-    rows = [row for row in monitor._frames if row[0] <= track.end_ns]  # the first are discarded
+    # The earliest frames have been discarded.
+    rows = [row for row in monitor._frames if row[0] <= track.end_ns]
     seen = np.stack([frame.markers for _, frame in rows])
     assert len(rows) > 1000
     assert track.t_ns[-len(rows) :].tolist() == [t_ns for t_ns, _ in rows]
@@ -137,7 +138,7 @@ def test_clock_restart_changes_the_lag_by_less_than_its_standard_deviation() -> 
     assert abs(float(str(after["tracked_ms"])) - float(str(before["tracked_ms"]))) <= float(
         str(before["tracked_sigma_ms"])
     )
-    # Settled elsewhere, within the accuracy of a clock: no step.
+    # After the restart, the lag differs by less than the accuracy of a clock. This is no step.
     assert play(monitor, 16.0, 4.8, start_s=32.0, epoch=2) == []
     assert lag_payload(monitor.health()["S1"])["tracked_ms"] == pytest.approx(4.8, abs=0.1)
 

@@ -64,5 +64,5 @@ def test_health_of_a_raw_source_contains_rest_and_bias() -> None:
     assert said["rest"] is True
     assert said["bias_rad_s"] == pytest.approx([0.01, 0.0, 0.0], abs=1e-3)
     assert said["settled"] is True
-    assert devices["S1"]["received"] == 1500 - 149  # at rest, the filter settles for 1.5 s
+    assert devices["S1"]["received"] == 1500 - 149  # the filter settles during the first 1.5 s
     assert "orientation_filter" not in devices["S3"]

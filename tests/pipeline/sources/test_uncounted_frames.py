@@ -1,4 +1,4 @@
-"""Frames of a server without frame numbers: a delayed one does not restart its clock."""
+"""Frames of a server without frame numbers: a delayed frame does not restart the clock."""
 
 from __future__ import annotations
 

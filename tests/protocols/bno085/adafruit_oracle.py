@@ -1,4 +1,7 @@
-"""Adafruit's packages for BNO08x as oracles, without the hardware layer that they import."""
+"""Import of Adafruit's packages for the BNO08x, with whose results tests compare the codecs.
+
+Substitutes replace the modules for hardware access that the packages import.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ import pytest
 
 @cache
 def adafruit(name: str) -> Any:
-    """Return a package of Adafruit; skip the test where it is not installed."""
+    """Return a package of Adafruit; skip the test if it is not installed."""
     busio, micropython = ModuleType("busio"), ModuleType("micropython")
     vars(busio)["UART"] = object
     vars(micropython)["const"] = int

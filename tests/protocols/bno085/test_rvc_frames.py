@@ -1,4 +1,7 @@
-"""UART-RVC: the message of the data sheet, any cut, every byte accounted for."""
+"""The UART-RVC codec decodes the frame of the data sheet, and counts every byte.
+
+The result does not depend on how the byte stream is split.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ if TYPE_CHECKING:
     from jointfit_protocols.corrupt import CorruptBytes
 
 EXAMPLE = bytes.fromhex("aaaade010092ff25088dfeecffd103000000e7")
-"""Message with its checksum in the data sheet 1000-3927."""
+"""Frame with its checksum, from the data sheet 1000-3927."""
 
 int16 = st.integers(-(2**15), 2**15 - 1)
 triples = st.tuples(int16, int16, int16)

@@ -1,4 +1,7 @@
-"""SHTP over UART: escapes, any cut, every byte accounted for, and reports in both directions."""
+"""The SHTP codec decodes escaped packets and counts every byte, however the stream is split.
+
+The reports of the sensor hub are converted in both directions.
+"""
 
 from __future__ import annotations
 
@@ -74,7 +77,7 @@ def test_payloads_survive_their_escapes(channel: int, sequence: int, payload: by
 
 
 def test_documented_bytes() -> None:
-    """Product id request, escapes, buffer status and its query, interval of a report."""
+    """Requests, escapes and the buffer status have the bytes in the documents of the vendor."""
     assert encode_shtp(2, 0, product_request()).hex() == "7e0106000200f9007e"
     assert encode_status(None).hex() == "7e007e"
     assert encode_shtp(2, 1, bytes((0x7E, 0x7D))).hex() == "7e01060002017d5e7d5d7e"
@@ -103,7 +106,7 @@ def test_a_silence_between_packets_costs_no_packet_and_one_inside_costs_its_rest
     codec = ShtpCodec()
     assert len(codec.feed(one)) == 1
     assert codec.flush() == []
-    (found,) = codec.feed(two[1:])  # shares the flag of the first
+    (found,) = codec.feed(two[1:])  # begins with the closing flag of the first packet
     assert isinstance(found, ShtpPacket)
     assert codec.feed(two[:4]) == []
     assert codec.flush() == [CorruptBytes(3, "cut off")]

@@ -41,7 +41,7 @@ def _parsed(log: bytes) -> Iterator[CanFrame | CorruptBytes]:
 
 
 def _frame(line: bytes) -> CanFrame | None:
-    """Return the frame in `line`, or None."""
+    """Return the frame in `line`; None if the line contains no frame."""
     words = line.split()
     if len(words) < 3:
         return None

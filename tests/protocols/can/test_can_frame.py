@@ -1,4 +1,4 @@
-"""CAN records, candump logs and error frames."""
+"""CAN records and candump logs are read without loss, and error frames are described."""
 
 from __future__ import annotations
 

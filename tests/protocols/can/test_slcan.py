@@ -1,4 +1,4 @@
-"""SLCAN, both roles."""
+"""The SLCAN codec as host and as adapter: frames, lines, corrupt bytes and stamps."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_a_frame_is_stamped_at_the_start_of_its_line() -> None:
 
 
 def test_a_line_that_came_whole_is_not_stamped_before_the_previous_read() -> None:
-    decoder = SlcanCodec(9_600)  # but the adapter is on USB and much faster
+    decoder = SlcanCodec(9_600)  # the configured speed; the adapter on USB is much faster
     line = encode_frame(CanFrame(0, 0x21, bytes(8)))
     decoder.feed(line, 1_000_000_000)
     (frame,) = decoder.feed(line, 1_001_000_000)

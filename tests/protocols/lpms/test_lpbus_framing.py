@@ -1,4 +1,4 @@
-"""LP-BUS framing: the vectors, any bytes, any cut, every byte accounted for."""
+"""The LP-BUS codec decodes the test vectors and counts every byte, however a stream is split."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_the_twenty_vectors_are_messages_or_corrupt_as_marked(shared_data: Path)
         (message,) = found
         assert isinstance(message, LpBusMessage), vector["id"]
         assert (message.size, message.end) == (len(wire), len(wire))
-        if vector["id"] != "lp-id-258-word-lrc":  # accepted, and never sent
+        if vector["id"] != "lp-id-258-word-lrc":  # is accepted, but never sent
             assert encode(message.command, message.data, message.sensor_id) == wire
         for key in ("sensor_id", "command"):
             if key in vector.get("decoded", {}):
@@ -142,7 +142,7 @@ def test_no_single_flipped_bit_passes(wire: bytes, place: int, bit: int) -> None
 
 
 def test_time_is_linear_in_bytes() -> None:
-    """Every byte of this stream starts a message of the greatest length."""
+    """Every seventh byte of this stream starts a candidate of the greatest length."""
     decoder = LpBusCodec()
     hostile = b"\x3a\x3a\x00\x3a\x00\x00\x04" * 3000
     for at in range(0, len(hostile), 7):

@@ -1,4 +1,7 @@
-"""LPMS on CAN: the vectors, cantools as an independent reader, halves in any order."""
+"""The LPMS codec for CAN agrees with the test vectors and with cantools.
+
+It combines the two frames of a quaternion only if they follow each other in order and in time.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands and data packets of both generations of LPMS."""
+"""Commands and data packets of both LPMS generations agree with the vendor's documents."""
 
 from __future__ import annotations
 
@@ -170,7 +170,7 @@ def test_commands_and_rates_are_those_of_the_register_headers() -> None:
 
 def test_the_configuration_word_of_generation_1_has_outputs_rate_and_precision() -> None:
     (read,) = GENERATION_1.reads
-    word = (0x0044_0006).to_bytes(4, "little")  # quaternion, int16, the last code of a rate
+    word = (0x0044_0006).to_bytes(4, "little")  # quaternion, int16, highest rate code
     found = LpmsConfiguration(0x0004_0000, 400, floats=False)
     assert decode_configuration(GENERATION_1, read, word) == found
     assert encode_configuration(GENERATION_1, read, found) == word
@@ -206,7 +206,7 @@ def test_the_two_generations_count_precision_in_opposite_senses() -> None:
 
 def test_a_read_of_one_generation_is_a_write_of_the_other() -> None:
     assert GENERATION_3.store in GENERATION_1.reads
-    assert GENERATION_3.factory_reset == 0x05  # status of generation 1
+    assert GENERATION_3.factory_reset == 0x05  # reads the status in generation 1
 
 
 @GENERATIONS

@@ -1,4 +1,4 @@
-"""Chunks of LSL streams: an independent reader, round trips, hostile lengths, random bytes."""
+"""The LSL codec: an independent XDF reader reads its chunks, and malformed chunks are counted."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ def test_a_length_of_eight_bytes_is_read() -> None:
 @pytest.mark.parametrize("samples", [1, 2])
 def test_samples_without_a_time_stamp_are_corrupt(samples: int) -> None:
     wire = bytearray(encode_samples("int8", [0.0] * samples, [[1]] * samples))
-    wire[-10] = 0  # the number of bytes of the last stamp
+    wire[-10] = 0  # the byte that states the size of the last stamp
     (found,) = described(1, "int8").feed(bytes(wire))
     assert found == CorruptBytes(len(wire), "sample without a time stamp")
 

@@ -1,4 +1,4 @@
-"""Numbers, layouts and limits of MIP commands and data fields, as the vendor's library has them."""
+"""Numbers, layouts and limits of MIP commands and fields agree with the vendor's library."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames and models of bitstreams 2.5 to 2.11, byte for byte and in both directions."""
+"""Frames and models of bitstreams 2.5 to 2.11 have the documented bytes in both directions."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ FRAME = FrameOfData(
 
 
 def fitting(version: tuple[int, int]) -> FrameOfData:
-    """Return the frame with what this bitstream can contain."""
+    """Return `FRAME` without the parts that bitstream `version` cannot contain."""
     frame = FRAME
     if version < (2, 11):
         frame = frame._replace(devices=())

@@ -1,4 +1,4 @@
-"""NatNet codec on real traffic: Motive 2.1, recorded beside the vendor's own client."""
+"""The NatNet codec decodes a capture of Motive 2.1 to the values that the vendor's client read."""
 
 from __future__ import annotations
 
@@ -191,6 +191,6 @@ def test_every_number_the_vendors_client_printed_is_ours(
     assert [int(block[0][0]) for block in blocks] == list(range(162734, 162985))
     for block in blocks:
         ours = as_printed(by_number[int(block[0][0])])
-        assert len(block) == len(ours) or block is blocks[-1]  # the last one was cut off
+        assert len(block) == len(ours) or block is blocks[-1]  # the last block is incomplete
         for wanted, line in zip(ours, block, strict=False):
             assert line == pytest.approx(wanted, abs=0.005 + 1e-6)

@@ -1,4 +1,4 @@
-"""Decoding by the layout of an earlier frame: equal to the decoder of any frame, or refused."""
+"""Decoding with the layout of an earlier frame returns the result of `decode`, or None."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_frame_by_layout_equals_the_decoded_one_for_any_changed_byte(
     changed = bytearray(datagram)
     changed[data.draw(st.integers(0, len(datagram) - 1))] ^= data.draw(st.integers(1, 255))
     found = layout.read(bytes(changed))
-    # texts, because NaN differs from itself
+    # compare texts, because NaN is not equal to NaN
     assert found is None or repr(found) == repr(decode(bytes(changed), version))
 
 
@@ -46,7 +46,7 @@ def test_a_layout_for_selected_sets_leaves_out_the_others_and_nothing_else(
     changed = bytearray(datagram)
     changed[data.draw(st.integers(0, len(datagram) - 1))] ^= data.draw(st.integers(1, 255))
     found = layout.read(bytes(changed))
-    if found is not None:  # unread numbers may have changed, and nothing else
+    if found is not None:  # only numbers that are not read may have changed
         whole = decode(bytes(changed), version)
         assert isinstance(whole, FrameOfData)
         sets = tuple(each for each in whole.marker_sets if each.name in selected)

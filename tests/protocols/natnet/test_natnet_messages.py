@@ -1,4 +1,4 @@
-"""NatNet codec: real captures, the vendor's test vector, and arbitrary bytes."""
+"""The NatNet codec: messages survive a round trip, and malformed datagrams become corrupt bytes."""
 
 from __future__ import annotations
 
@@ -200,7 +200,7 @@ def test_bytes_left_over_make_a_frame_corrupt(
     wire = bytearray(encode(*case)) + bytes(more)
     struct.pack_into("<H", wire, 2, len(wire) - 4)
     found = decode(bytes(wire), case[1])
-    if isinstance(found, FrameOfData):  # 8 bytes more can be a precision timestamp, in zeros
+    if isinstance(found, FrameOfData):  # 8 additional zeros can be a precision timestamp
         assert case[0].precision is None or found.skipped
     else:
         assert isinstance(found, CorruptBytes)
@@ -221,7 +221,7 @@ def test_count_beyond_the_remaining_bytes_is_rejected(count: int) -> None:
 
 
 def test_a_count_of_channels_that_leaves_a_channel_without_its_size_is_rejected() -> None:
-    # id, 4 channels, and room for the sizes of 3
+    # the id, the number of channels (4), and the sizes of only 3 channels
     with pytest.raises(MalformedError, match="a count exceeds the datagram"):
         read_analogs(Cursor(struct.pack("<iiiii", 1, 4, 0, 0, 0)), 1)
     found = read_analogs(Cursor(struct.pack("<iiiiii", 1, 4, 0, 0, 0, 0)), 1)
@@ -229,7 +229,7 @@ def test_a_count_of_channels_that_leaves_a_channel_without_its_size_is_rejected(
 
 
 def test_a_name_of_255_bytes_is_accepted_and_a_longer_one_is_refused() -> None:
-    longest = "é" * 127 + "n"  # 2 bytes each, and 1
+    longest = "é" * 127 + "n"  # 127 letters of 2 bytes and one of 1 byte
     model = ModelDefinition((MarkerSetDescription(longest, ()),))
     assert decode(encode(model), (3, 0)) == model
     with pytest.raises(ValueError, match="at most 255 bytes"):
@@ -271,7 +271,8 @@ def test_from_4_1_a_malformed_section_is_skipped_by_its_size() -> None:
 def test_a_section_that_a_later_bitstream_added_is_skipped() -> None:
     wire = encode(FrameOfData(7, 0.0, 1, 2, 3), (4, 1))
     new = struct.pack("<ii", 1, 12) + bytes(range(12))
-    tail = struct.calcsize("<IIdQQQ") + 14  # stamps; precision, params, end tag
+    # The stamps are followed by 14 bytes: precision timestamp, flags and end tag.
+    tail = struct.calcsize("<IIdQQQ") + 14
     grown = wire[4:-tail] + new + wire[-tail:]
     found = decode(struct.pack("<HH", 7, len(grown)) + grown, (4, 3))
     assert isinstance(found, FrameOfData)

@@ -1,4 +1,4 @@
-"""Precision timestamps of frames from a server without a PTP clock."""
+"""Precision timestamps with fractions of zero: their time, and when it becomes known."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Packets of the QTM real-time protocol: published bytes, round trips, and hostile input."""
+"""QTM packets have the published bytes, survive a round trip, and malformed ones are refused."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ FRAME = bytes.fromhex(
     + "ff" * 48
     + "000080bf 18000000 11000000 01000000 02000000 01000000 02000000"
 )
-"""Body 0 at (100, 200, 300) mm, turned by +90° about z; body 1 missing; camera time."""
+"""Frame with camera time: body 0 is at (100, 200, 300) mm, rotated by +90° about z; body 1 is
+missing."""
 FLOATS = st.floats(width=32, allow_nan=False)
 U32 = st.integers(0, 2**32 - 1)
 

@@ -1,4 +1,4 @@
-"""Settings XML: the vendor's examples, older layouts, and hostile documents."""
+"""The QTM settings parser reads the vendor's examples and older layouts, and refuses others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""CAN frames by table: assembly of samples, lost and foreign frames."""
+"""Assembly of samples from the CAN frames that a table describes, with lost and foreign frames."""
 
 from __future__ import annotations
 

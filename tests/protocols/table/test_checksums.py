@@ -1,4 +1,4 @@
-"""Checksums by parameters give the published check values of "123456789"."""
+"""Checksums that parameters describe return the published check values of "123456789"."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_check_values(checksum: Checksum, value: int) -> None:
 
 
 def test_fletcher_of_bytes_in_turn() -> None:
-    """As vendors print it: a = a + byte, b = b + a."""
+    """The checksum equals the loop in manuals: a = a + byte, b = b + a."""
     for modulus in (255, 256):
         a, b = 3, 5
         for byte in TEXT:

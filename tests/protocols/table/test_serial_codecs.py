@@ -1,4 +1,4 @@
-"""Frames and lines by table: any split, damaged bytes, other messages, bounded pending bytes."""
+"""Codecs of frames and lines that a table describes: splits, damage, and other messages."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def decode(form: FrameFormat | LineFormat, data: bytes, piece: int) -> list[obje
     decoder, out = codec(form), []
     for at in range(0, len(data), piece):
         out += decoder.feed(data[at : at + piece])
-        assert decoder.pending <= decoder.longest + 2  # the next sync bytes
+        assert decoder.pending <= decoder.longest + 2  # two sync bytes may follow
     out += decoder.flush()
     lost = sum(item.discarded for item in out if isinstance(item, CorruptBytes))
     taken = sum(len(item.data) for item in out if isinstance(item, TableMessage))

@@ -1,4 +1,4 @@
-"""Numbers at any place of a frame: an independent reader of DBC files finds the same ones."""
+"""Numbers at any position of a frame have the values that an independent DBC reader returns."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def independent_values(fields: Sequence[TableField], data: bytes) -> list[float]
 
 @st.composite
 def layouts(draw: st.DrawFn) -> list[TableField]:
-    """Fields of one CAN frame, without overlap, in any order."""
+    """Draw fields of one CAN frame that do not overlap, in any order."""
     fields: list[TableField] = []
     for _ in range(draw(st.integers(1, 5))):
         order: ByteOrder = draw(st.sampled_from(("little", "big")))
@@ -61,7 +61,8 @@ def layouts(draw: st.DrawFn) -> list[TableField]:
 @given(layouts(), st.binary(min_size=8, max_size=8))
 def test_every_place_reads_as_in_a_dbc_file(fields: list[TableField], data: bytes) -> None:
     ours = FieldReader(fields).read(b"\xff" + data, 1)
-    assert repr([*ours]) == repr(independent_values(fields, data))  # NaN has a text, too
+    # Texts are compared, because NaN is not equal to NaN.
+    assert repr([*ours]) == repr(independent_values(fields, data))
 
 
 @given(layouts(), st.data())
@@ -119,7 +120,7 @@ def test_a_signed_number_of_63_bits_ignores_the_last_bit_of_its_bytes() -> None:
 
 
 def test_overlaps_are_found_across_byte_orders() -> None:
-    # A big-endian number of 12 bits at byte 0 leaves the low half of byte 1.
+    # A big-endian number of 12 bits at byte 0 does not occupy the low four bits of byte 1.
     big = TableField(0, "u", 12, "big")
     assert overlaps({"a": big, "b": TableField(1, "u", 4)}) == []
     assert overlaps({"a": big, "b": TableField(1, "u", 4, bit=4)}) == [("a", "b")]

@@ -1,4 +1,4 @@
-"""VectorNav framing: any bytes in any chunks; every byte is accounted for."""
+"""The VectorNav codec counts every byte of any stream, however the stream is split."""
 
 from __future__ import annotations
 
@@ -91,12 +91,12 @@ def test_an_encoded_output_decodes_to_itself(t_ns: int, q: tuple[float, ...]) ->
 
 
 def test_an_output_has_the_documented_bytes() -> None:
-    """Common group, fields 0 and 4: 1 + 1 + 2 + 8 + 16 + 2 bytes."""
+    """An output with fields 0 and 4 of the common group has 1 + 1 + 2 + 8 + 16 + 2 bytes."""
     wire = encode_binary(ORIENTATION)
     body = b"\x01\x11\x00" + struct.pack("<Q4f", 1_000_000, 0.5, -0.5, 0.1, 0.7)
     assert wire[:1] + wire[1:-2] == b"\xfa" + body
     crc = 0
-    for byte in body:  # the loop of the manual
+    for byte in body:  # the CRC as the manual computes it
         crc = (crc >> 8 | crc << 8) & 0xFFFF
         crc ^= byte
         crc ^= (crc & 0xFF) >> 4
@@ -121,7 +121,8 @@ def test_fields_have_the_numbers_of_the_manual() -> None:
 
 @pytest.mark.parametrize("group", [*range(7), 12])
 def test_field_sizes_equal_those_of_the_vendors_library(group: int) -> None:
-    gnss = [8, 8, 2, 1, 1, 24, 24, 12, 12, 12, 4, 4, 2, 28, 2, 8]  # the last two: 17 and 18
+    # The last two sizes belong to the fields 17 and 18.
+    gnss = [8, 8, 2, 1, 1, 24, 24, 12, 12, 12, 4, 4, 2, 28, 2, 8]
     sizes = [
         [8, 8, 8, 12, 16, 12, 24, 12, 12, 24, 20, 28, 2, 4, 8],
         [8, 8, 8, 2, 8, 8, 8, 4, 4, 1],
@@ -173,7 +174,7 @@ def test_a_single_flipped_bit_never_passes(wire: bytes, place: int, bit: int) ->
     bad[place % len(wire)] ^= 1 << bit
     found, _ = decode([bytes(bad)])
     whole = [one for one in found if not isinstance(one, CorruptBytes) and one.size == len(wire)]
-    # the case of a hexadecimal digit of the checksum has no meaning
+    # hexadecimal digits of the checksum may be upper or lower case
     assert not whole or bytes(bad).upper() == wire.upper()
 
 
@@ -212,7 +213,7 @@ def test_text_messages_with_either_checksum_are_read() -> None:
 
 
 def test_no_message_of_one_family_is_one_of_the_other() -> None:
-    """Both start with FA: an Xbus header announces groups that VectorNav does not have."""
+    """Both start with FA, but an Xbus header announces groups that VectorNav does not have."""
     other = [xbus.encode(0x36, bytes(range(size))) for size in range(0, 255, 7)]
     assert decode(other)[1].messages == 0
     codec = xbus.XbusCodec()

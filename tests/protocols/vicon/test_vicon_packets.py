@@ -1,4 +1,4 @@
-"""Packets of the Vicon DataStream: published bytes, round trips, and hostile input."""
+"""Vicon packets have the published bytes, survive a round trip, and malformed ones are refused."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FRAME = bytes.fromhex(
     "0000000000005940 0000000000006940 0000000000c07240"
     + ZERO + MINUS_ONE + ZERO + ONE + ZERO + ZERO + ZERO + ZERO + ONE
 )  # fmt: skip
-"""Frame 41 with segment 1 of subject 1 at (100, 200, 300) mm, turned by +90° about z."""
+"""Frame 41. Segment 1 of subject 1 is at (100, 200, 300) mm, rotated by +90° about z."""
 
 U32 = st.integers(0, 2**32 - 1)
 F64 = st.floats(allow_nan=False)

@@ -1,4 +1,7 @@
-"""The VRPN codec: byte vectors of the reference implementation, any split, hostile lengths."""
+"""The VRPN codec agrees with bytes of the reference implementation, however a stream is split.
+
+Messages with an impossible length or malformed content are rejected.
+"""
 
 from __future__ import annotations
 
@@ -74,7 +77,9 @@ def decoded(*pieces: bytes) -> list[VrpnContent | CorruptBytes]:
 
 
 def on_the_wire(messages: list[VrpnContent]) -> bytes:
-    """Return the messages after the descriptions that they need, also after a cookie."""
+    """Return the bytes of `messages`. The descriptions precede the first message, and are repeated
+    after each cookie.
+    """
     parts = [DESCRIBED]
     for message in messages:
         parts.append(encode(message, IDS))
@@ -227,7 +232,7 @@ def test_defaults_are_those_of_the_reference_implementation() -> None:
 def test_lost_bytes_are_reported_in_bounded_runs() -> None:
     codec = VrpnCodec()
     found = codec.feed(bytes(200_000))
-    assert codec.pending == len("vrpn: ver.")  # with one more byte it could be a cookie
+    assert codec.pending == len("vrpn: ver.")  # these bytes may be the beginning of a cookie
     found += codec.flush()
     sizes = [item.discarded for item in found if isinstance(item, CorruptBytes)]
     assert sum(sizes) == codec.discarded == 200_000
@@ -271,7 +276,7 @@ def test_whole_messages_end_between_messages(messages: list[VrpnContent], size: 
 
 
 def test_pending_bytes_are_bounded_and_their_cost_is_linear() -> None:
-    """A message of the longest length, in single bytes, costs no copy of its beginning."""
+    """If the longest message is fed in single bytes, its beginning is not copied for each byte."""
     head = struct.pack(">I", vrpn.MAX_MESSAGE)
     pieces = [bytes((byte,)) for byte in head + bytes(vrpn.MAX_MESSAGE)]
     codec = VrpnCodec()

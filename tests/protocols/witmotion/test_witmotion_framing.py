@@ -1,4 +1,4 @@
-"""WitMotion frames: documented bytes, any cut, every byte accounted for."""
+"""The WitMotion codec decodes documented frames and counts every byte, however data are split."""
 
 from __future__ import annotations
 
@@ -245,7 +245,9 @@ def test_a_read_command_is_a_write_to_the_register_read() -> None:
 
 @given(counts, counts, counts, counts)
 def test_the_witmotion_package_reads_the_same_values(w: int, x: int, y: int, z: int) -> None:
-    """Its quaternion, acceleration and rate; its epoch of time differs from the vendor's page."""
+    """The package agrees on quaternion, acceleration and rate. Times are not compared, because the
+    package uses another epoch than the vendor's page.
+    """
     oracle = pytest.importorskip("witmotion.protocol")
     data = encode_counts((w, x, y, z))
     assert oracle.QuaternionMessage.compute_checksum(data) == encode(0x59, data)[-1]

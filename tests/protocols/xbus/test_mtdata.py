@@ -1,4 +1,4 @@
-"""MTData of older devices: fields by output mode and settings, in every format of reals."""
+"""MTData of older devices: output mode and settings determine fields and number formats."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MTData2: items in, items out; recorded devices agree."""
+"""MTData2 items survive a round trip, and recorded messages have the expected values."""
 
 from __future__ import annotations
 
@@ -234,7 +234,7 @@ STEPS = {
     "3": {100: 91, -418: 3, 518: 3, -518: 1, 618: 1},
     "5": {100: 88, -514: 2, 614: 2, -414: 2, 514: 2, 0: 2, 50: 1},
 }
-COUNT = {  # Euler, delta q, matrix, quaternion, PVT
+COUNT = {  # numbers of items: Euler angles, delta q, matrix, quaternion, PVT
     "1": (95, 96, 0, 0, 4),
     "3": (95, 96, 0, 0, 4),
     "5": (0, 0, 92, 92, 3),

@@ -1,4 +1,4 @@
-"""Numbers and names of sync lines, functions and polarities, as in the manual."""
+"""Numbers and names of sync lines, functions and polarities agree with the manual."""
 
 from __future__ import annotations
 

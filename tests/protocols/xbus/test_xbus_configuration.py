@@ -1,4 +1,4 @@
-"""Setup messages of Xbus devices: encoding, decoding, and documented bytes."""
+"""Setup messages of Xbus devices survive a round trip, and have the documented bytes."""
 
 from __future__ import annotations
 

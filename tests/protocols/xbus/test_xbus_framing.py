@@ -1,4 +1,4 @@
-"""Xbus framing: any bytes in any chunks; every byte is accounted for."""
+"""The Xbus codec counts every byte of any stream, however the stream is split into chunks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""XCDI: the vectors, an independent reader of the tables, groups, and the unit of SampleTime."""
+"""The XCDI codec agrees with the test vectors and with an independent DBC reader.
+
+Groups are assembled for each sensor, and the unit of SampleTime is determined from the data.
+"""
 
 from __future__ import annotations
 
@@ -81,7 +84,8 @@ MESSAGES = {
 def test_an_independent_reader_agrees(shared_data: Path, data_id: DataId) -> None:
     oracle = cantools.database.load_file(shared_data / "imu" / "dbc" / "xsens_mti_xcdi.dbc")
     assert isinstance(oracle, cantools.database.Database)
-    scale = 0.0001 if data_id is DataId.SAMPLE_TIME else layout(data_id).scale  # the DBC's unit
+    # The DBC file assumes ticks of 100 us for SampleTime.
+    scale = 0.0001 if data_id is DataId.SAMPLE_TIME else layout(data_id).scale
 
     @given(MESSAGES[data_id])
     def agree(counts: tuple[int, ...]) -> None:

@@ -63,7 +63,7 @@ def read_by_vendor(wire: bytes, file: Path) -> tuple[list[tuple[Any, ...]], list
 
         getattr(connection, f"add_{name}_callback")(add_text)
 
-    # The client reads the file in a thread of its own, and ends without a notice.
+    # The client reads the file in a separate thread, and does not report the end of the file.
     expected = wire.count(b"\n")
     connection.open()
     until = time.monotonic() + 20
@@ -128,7 +128,8 @@ def test_both_count_the_same_messages_in_the_recording(tmp_path: Path, shared_da
     found, errors = read_by_vendor(wire, tmp_path / "copy.ximu3")
     assert errors == []
     assert len(found) == 203
-    assert found[1:] == read_here(wire)[1:]  # the first message is ASCII: the client reads float32
+    # The first message is ASCII, and the client rounds its numbers to float32.
+    assert found[1:] == read_here(wire)[1:]
 
 
 def test_both_refuse_the_same_malformed_lines(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""x-IMU3 messages: any bytes in any chunks; every byte is accounted for."""
+"""The x-IMU3 codec counts every byte of any stream, however the stream is split into chunks."""
 
 from __future__ import annotations
 
@@ -225,7 +225,7 @@ def test_a_message_after_one_that_lost_its_end_is_found(kept: int, message: byte
     truncated = encode_data("Q", 1, (1.0, 0.0, 0.0, 0.0))[:kept]
     found, _ = decode([truncated + message])
     (plain,), _ = decode([message])
-    assume(isinstance(found[0], CorruptBytes))  # both parts may have the length of a message
+    assume(isinstance(found[0], CorruptBytes))  # the joined parts may happen to be a valid message
     assert found[0].discarded == kept
     assert found[1:] == [plain._replace(end=kept + len(message))]
 

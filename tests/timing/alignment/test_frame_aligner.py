@@ -1,4 +1,4 @@
-"""Frames at fixed times from streams that are late, lossy, fast, slow, restarting or silent."""
+"""Aligner: frames at fixed times from late, lossy, fast, slow, restarted or silent streams."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0)
 VERDICTS = [verdict.value for verdict in SampleOutcome]
 
 Push = tuple[int, str, int]
-"""Arrival time, stream and stamp of a sample."""
+"""Arrival time (ns), name of the stream, and stamp (ns) of a sample."""
 
 
 def turned(t_ns: int, rate: float = 2.0) -> tuple[float, float, float, float]:
@@ -80,7 +80,7 @@ def test_a_frame_leaves_with_the_sample_that_completes_it() -> None:
         "B", 10 * MS, 50, phase=6 * MS, delay=MS
     )
     for frame in play(a, pushes):
-        assert frame.completed_ns == frame.t_ns + 7 * MS  # B's sample 6 ms later, delayed by 1 ms
+        assert frame.completed_ns == frame.t_ns + 7 * MS  # B's next sample: 6 ms later, delay 1 ms
 
 
 @pytest.mark.parametrize("lost", [[40], [40, 41], [40, 41, 42, 43]])
@@ -176,7 +176,7 @@ def test_a_stream_faster_than_the_frames_is_decimated() -> None:
     play(a, stream("A", 2_500_000, 400, phase=MS))
     counts = assert_accounted(a, "A")
     assert counts["decimated"] == pytest.approx(100, abs=4)
-    assert counts["used"] == pytest.approx(298, abs=4)  # two neighbours and one sample before them
+    assert counts["used"] == pytest.approx(298, abs=4)  # two neighbors, and the sample before them
 
 
 def test_a_slow_stream_is_interpolated_between_its_samples() -> None:
@@ -204,7 +204,7 @@ def test_a_reordered_sample_takes_its_place_and_a_late_one_does_not() -> None:
 
 def test_a_frame_does_not_remember_neighbors_that_a_reordered_sample_parted() -> None:
     found = []
-    for frames_before in (3, 0):  # frames at 0, 10 and 20 ms; the last two between 0 and 29 ms
+    for frames_before in (3, 0):  # 3: a frame at 0 ms, and two frames between samples
         a = aligner(A=10 * MS)
         for t, rate in ((0, 2.0), (29, 2.0), (22, 9.0), (39, 2.0)):
             if t == 22:
@@ -227,10 +227,10 @@ def test_frames_without_orientations_go_on_while_all_streams_are_silent() -> Non
     assert all(not f.missing for t, f in of.items() if t < 1000 or t > 2010)
     silent = [f for t, f in of.items() if 1010 < t < 1990]
     assert all(f.missing == {"A", "B"} and not f.orientations for f in silent)
-    assert all(f.synced for f in silent)  # no stream has ended
+    assert all(f.synced for f in silent)  # silent streams have not ended
     waited = [f.completed_ns - f.t_ns for f in silent]
-    assert waited[0] == 26 * MS  # both are lost 50 ms after the last sample
-    assert set(waited[1:]) == {17_500_000}  # the usual delay, and one and a half periods
+    assert waited[0] == 26 * MS  # B is lost 50 ms after its last sample, A earlier
+    assert set(waited[1:]) == {17_500_000}  # usual delay of A, 3 ms, plus 1.45 periods
     assert a.skipped_frames == 0
     for name in "AB":
         assert assert_accounted(a, name)["dropped"] == 0
@@ -416,7 +416,7 @@ streams = st.fixed_dictionaries(
         "delay": st.integers(0, 30 * MS),
         "jitter": st.integers(0, 12 * MS),
         "gap": st.tuples(st.integers(0, 900), st.integers(0, 400)),  # start and length, ms
-        "restart": st.integers(0, 2_000),  # ms; no restart beyond a second
+        "restart": st.integers(0, 2_000),  # ms; above 1000 the stream does not restart
         "every_twice": st.integers(3, 50),
         "every_lost": st.integers(3, 50),
     }
@@ -424,7 +424,7 @@ streams = st.fixed_dictionaries(
 
 
 def sent(name: str, given_by: dict[str, Any], dice: Random) -> list[tuple[int, str, int, int]]:
-    """Return arrival, stream, stamp and epoch of one device's samples in one second."""
+    """Return arrival (ns), stream, stamp (ns) and epoch of a device's samples in one second."""
     found = []
     begin, length = given_by["gap"]
     for k in range(1_000 * MS // given_by["period"]):
@@ -469,6 +469,6 @@ def test_every_sample_has_one_outcome_and_frames_are_correct_for_any_device(
         assert early[name] <= counts["late"] + counts["duplicate"] + counts["dropped"]
     assert all(one.t_ns < other.t_ns for one, other in pairwise(frames))
     assert all(one.completed_ns <= other.completed_ns for one, other in pairwise(frames))
-    for frame in frames:  # a constant rate is reproduced exactly, also beyond the samples
+    for frame in frames:  # motion at a constant rate is also extrapolated exactly
         for q in frame.orientations.values():
             assert q == pytest.approx(turned(frame.t_ns), abs=1e-9)

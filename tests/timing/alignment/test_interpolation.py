@@ -1,4 +1,7 @@
-"""Interpolation and extrapolation: exact at constant rate, better than slerp in fast motion."""
+"""Interpolation and extrapolation of orientations.
+
+The results are exact at a constant rate. In fast motion, their errors are smaller than with slerp.
+"""
 
 from __future__ import annotations
 
@@ -194,7 +197,7 @@ def turned(angle: float) -> Quaternion:
 
 @pytest.mark.experiment
 def test_mean_rates_are_worse_than_no_rates() -> None:
-    """A driver must therefore omit mean rates (``ImuSample.rate``)."""
+    """A driver must therefore not send mean rates in ``ImuSample.rate``."""
 
     def mean(number: int) -> Sample:
         q, before = MOTION(0.5 + number * STEP * 1e-9)[0], MOTION(0.5 + (number - 1) * STEP * 1e-9)

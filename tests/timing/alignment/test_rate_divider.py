@@ -1,4 +1,4 @@
-"""Selection of frames at a lower rate: mean rate, pauses, wrong stamps."""
+"""Rate divider: mean rate of the selected frames, pauses, and wrong stamps."""
 
 from __future__ import annotations
 

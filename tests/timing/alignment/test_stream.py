@@ -1,4 +1,4 @@
-"""Reach of the last sample of a stream, and how long a frame waits for a stream without samples."""
+"""Stream of the aligner: longest extrapolation, and wait for a stream without samples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Events of a clock: reboot or jump, the sizes in the text and in the data, and skew limits."""
+"""Clock events: choice between restart and jump, sizes in text and data, and limits of the skew."""
 
 from __future__ import annotations
 

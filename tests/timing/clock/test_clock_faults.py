@@ -1,4 +1,4 @@
-"""Clock faults: jumps, pauses and wrong timestamps are reported, and time recovers within 5 s."""
+"""Clock faults: jumps, pauses and wrong stamps are reported; stamps are correct again after 5 s."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ HEALED_NS = 5 * S
 
 
 def longest_run_back(stamps: list[int]) -> int:
-    """Return the largest number of successive stamps that are not later than the newest one."""
+    """Return the largest number of successive stamps that are not later than an earlier stamp."""
     newest, now, most = -1, 0, 0
     for t in stamps:
         now = now + 1 if t <= newest else 0
@@ -59,7 +59,7 @@ class ClockFaultRun:
             self.counter += 1
 
     def check(self, since: int, news: str) -> None:
-        """Check that stamps never decrease, are correct 5 s after sample `since`, and the news."""
+        """Check the news, the order of stamps, and that stamps are correct 5 s after `since`."""
         assert longest_run_back([stamp.t_ns for _, stamp in self.out]) < BACKWARD_LIMIT
         for number, (true, stamp) in enumerate(self.out):
             healed = number >= since + HEALED_NS // PERIOD

@@ -1,4 +1,4 @@
-"""Thresholds of the clock experiments of bench, with fewer runs."""
+"""Clock experiments of bench with fewer runs: the results are within enlarged thresholds."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ if TYPE_CHECKING:
 
 NOWHERE = Path()
 SLACK = 1.5
-"""Factor for thresholds. With few runs, the 99th percentile is the maximum, and the RMS varies."""
+"""Factor that enlarges the thresholds. With few runs, the 99th percentile is the maximum, and the
+RMS varies.
+"""
 
 
 def kept(figure: Result) -> bool:

@@ -17,11 +17,11 @@ from jointfit_daemon.timing.clock._minimum_delay import MinimumDelayFilter
         (2, 254, 0, 258),
         (254, 258, 0, 254),
         (127, 0, 0, 127),
-        (128, 0, 0, -128),  # half a turn counts as older
+        (128, 0, 0, -128),  # a change of half a turn counts as an older reading
         (0, 0, 256, 256),
-        (5, 3, 64, 5),  # a quarter turn: the nearest count
+        (5, 3, 64, 5),  # after a quarter turn, the nearest count is used
         (3, 5, 64, 3),
-        (3, 5, 65, 3),  # beyond it, host time decides
+        (3, 5, 65, 3),  # after more than a quarter turn, host time determines the count
         (3, 5, 127, 259),
         (5, 3, 2 * 256 + 2, 2 * 256 + 5),
         (5, 3, 2 * 256 + 129, 2 * 256 + 5),

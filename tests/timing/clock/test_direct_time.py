@@ -1,4 +1,4 @@
-"""Sync edges and declared clocks replace the arrival statistics, unless both contradict."""
+"""Direct time from sync edges and declared clocks is used unless arrivals contradict it."""
 
 from __future__ import annotations
 
@@ -97,12 +97,12 @@ def test_edges_remove_the_smallest_delay_to_a_few_microseconds() -> None:
     wired = Wired(least_delay_ms=2.2)
     wired.run(20.0, pulses=False)
     assert wired.imu.state == "passive"
-    assert np.mean(wired.imu_errors_us(100)) == pytest.approx(1200, abs=30)  # unobservable
+    assert np.mean(wired.imu_errors_us(100)) == pytest.approx(1200, abs=30)  # 2.2 ms less the prior
     wired.run(20.0, begin=20.0)
     assert wired.imu.state == "direct"
     assert wired.imu.epoch == 0
     between = np.mean(wired.imu_errors_us(100)) - np.mean(wired.frame_errors_us(100))
-    assert abs(between) < 3.0  # difference of both streams, without the error of the echoes
+    assert abs(between) < 3.0  # the error of the echoes is common to both streams
     assert wired.stamps[-1][1].sigma_ns < 30_000
 
 
@@ -168,7 +168,7 @@ def test_a_declared_clock_that_arrivals_contradict_is_an_event_and_not_used() ->
     host = TickClock(1, None, None, "monotonic")
     for k in range(600):
         t = START + k * IMU
-        clock.feed_sample(t - 40 * MS, None, t + MS, host)  # 40 ms behind the declared clock
+        clock.feed_sample(t - 40 * MS, None, t + MS, host)  # the device clock is 40 ms slow
     assert clock.state == "passive"
     assert [news.kind for news in clock.news] == ["warning", "clock"]
     assert "sync time differs" in clock.news[0].text

@@ -1,4 +1,4 @@
-"""Server clocks from answered echoes, simulated and in a real capture."""
+"""Clocks of servers, estimated from answered echoes: simulated echoes and a real capture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A host without CPU time reads late and in bursts; this is no restart of a device clock."""
+"""Late reads and bursts on a host without CPU time do not count as restarts of a device clock."""
 
 from __future__ import annotations
 
@@ -24,13 +24,18 @@ PERIOD = 10 * MS
 START = 7_000 * S
 OWN = TickClock(1000, 1 << 32)
 SETTLING_S = 8.0
-"""Settling time of a clock if the host stalls from the start, s: three times the usual time."""
+"""Settling time of a clock if the host stalls from the start, s: three times the time without
+stalls.
+"""
 
 
 def read_late(
     stalls_s: Sequence[tuple[float, float]], seconds: float, begin_s: float
 ) -> NDArray[np.int64]:
-    """Return arrivals of the samples of a device at a host that alternately works and stalls."""
+    """Return the arrivals, ns, of a device's samples at a host that works and stalls in turn.
+
+    The device sends for `seconds`. The stalls begin at `begin_s`.
+    """
     rng = np.random.default_rng(1)
     n = int(seconds * S / PERIOD)
     due = START + np.arange(n) * PERIOD + rng.exponential(3e5, n).astype(np.int64)
@@ -65,9 +70,9 @@ samples, increasing delays cannot be distinguished from a slow clock.
 @settings(max_examples=15, deadline=None)
 @given(stalls, st.sampled_from([0.0, 6.0]))
 @example([(0.01, 2.0)], 6.0)
-@example([(0.103515625, 1.0234375)], 0.0)  # waits of 14 ms are no jitter
-@example([(0.5, 1.0), (0.5, 2.0)], 0.0)  # most samples waited
-@example([(0.25, 1.0)], 0.0)  # a line through two bursts is not exact to 1 ms
+@example([(0.103515625, 1.0234375)], 0.0)  # delays of 14 ms must not count as jitter
+@example([(0.5, 1.0), (0.5, 2.0)], 0.0)  # most samples are late
+@example([(0.25, 1.0)], 0.0)  # two bursts do not determine a line to 1 ms
 def test_stalls_and_bursts_are_late_data_and_no_restart(
     stalls_s: list[tuple[float, float]], begin_s: float
 ) -> None:
@@ -120,7 +125,7 @@ def test_one_wrong_arrival_time_is_no_restart() -> None:
 
 
 def test_a_backward_step_of_the_estimate_is_reported_once() -> None:
-    """After a long full queue, punctual samples give one news and unsynced stamps for a while."""
+    """After a long full queue, punctual samples cause one event and some unsynced stamps."""
     arrivals = read_late([(100.0, 0.0)], 30.0, 0.0)
     arrivals[:1500] += 300 * MS
     clock, out = stamped(arrivals)

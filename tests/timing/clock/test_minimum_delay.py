@@ -1,4 +1,4 @@
-"""The minimum-delay line, compared with an exhaustive search, and unwrapping of counters."""
+"""Minimum-delay line, compared with an exhaustive search; and unwrapping of counters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Timestamps follow their estimate at 500 ppm at most, and never decrease."""
+"""Timestamps approach their estimate at a rate of at most 500 ppm, and never decrease."""
 
 from __future__ import annotations
 

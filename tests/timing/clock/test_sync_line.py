@@ -1,4 +1,4 @@
-"""Edges are matched to the nearest instant of the reference, if it is unambiguous."""
+"""Edges are matched to the nearest instant of the reference, if the match is unambiguous."""
 
 from __future__ import annotations
 

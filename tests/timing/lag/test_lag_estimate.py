@@ -94,7 +94,8 @@ def test_ten_seconds_at_camera_rate_suffice(excerpt: Excerpt) -> None:
     lag, tolerance, spread = EXPECTED_MS[excerpt.name]
     assert np.mean(found) == pytest.approx(lag, abs=tolerance)
     assert np.std(found) < spread
-    assert 0.2 < np.std(found) / np.median(sigmas) < 1.5  # low, because windows overlap
+    # The scatter is low, because windows overlap.
+    assert 0.2 < np.std(found) / np.median(sigmas) < 1.5
 
 
 def test_gaps_do_not_move_the_lag(excerpt: Excerpt) -> None:
@@ -109,7 +110,7 @@ def test_gaps_do_not_move_the_lag(excerpt: Excerpt) -> None:
 
 
 def test_integrated_orientations_lead_the_gyroscope(excerpt: Excerpt) -> None:
-    """Integrated orientations lead the gyroscope by half a sample, so lags are not reusable."""
+    """Integrated orientations lead the gyroscope by half a sample, so the two lags differ."""
     steps = Rotation.from_rotvec(excerpt.gyro * 7 / 2000)
     path = [Rotation.identity()]
     for step in steps[571:4000]:
@@ -225,7 +226,7 @@ def test_either_stream_may_be_the_faster_one() -> None:
 
 
 def test_errors_are_consistent_with_sigma() -> None:
-    """The errors divided by their sigma have a deviation of about one over the windows."""
+    """Over all windows, the standard deviation of error / sigma is about one."""
     ratios = []
     for seed in range(16):
         estimate = estimate_lag(*made_up(seed, 5 * MS, noise=0.004, seconds=6.0))
@@ -274,7 +275,8 @@ def test_periodic_motion_is_ambiguous_in_a_wide_search() -> None:
     refused = estimate_lag(t_ns, q, t_ns, q, LagSettings(span_s=3.0)).refused
     assert refused is not None
     assert "periodic" in refused
-    assert estimate_lag(t_ns, q, t_ns, q).refused is None  # mapped clocks: nearest lag
+    # The default span excludes the other lags.
+    assert estimate_lag(t_ns, q, t_ns, q).refused is None
 
 
 @pytest.mark.parametrize("span_s", [0.5, 1.0, 3.0])
@@ -341,7 +343,7 @@ def test_a_step_is_reported_once_and_an_outlier_never() -> None:
     ]
     assert len(steps) == 1
     number, step_ns = steps[0]
-    assert number - 21 < 8  # windows of 2.5 s, so within 20 s
+    assert number - 21 < 8  # one window every 2.5 s, so within 20 s
     assert step_ns / MS == pytest.approx(3.0, abs=0.5)
 
 

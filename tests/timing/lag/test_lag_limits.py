@@ -17,7 +17,7 @@ PERIOD_S = 0.01
 
 
 def rates(begin_s: float, count: int) -> Rates:
-    """Return rates of one movement from an instant on."""
+    """Return `count` rates of one movement, from the instant `begin_s` on."""
     t = begin_s + PERIOD_S * np.arange(count, dtype=np.float64)
     w = np.column_stack([np.sin(3.0 * t) + 2.0, np.cos(7.0 * t), 0.3 * t])
     return Rates(t, w, np.zeros(count, dtype=np.intp), PERIOD_S, 1.0)

@@ -1,4 +1,4 @@
-"""Lag windows with little motion; tests/bench/test_tables.py tests the targets."""
+"""Lag estimates from windows with little motion; tests/bench/test_tables.py tests the targets."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 TICK_MS, PERIOD_S = 0.5, 3.9
-"""Height and period of a sawtooth error of stamps, at a skew of 128 ppm."""
+"""Height (ms) and period (s) of a sawtooth error of the stamps, at a skew of 128 ppm."""
 
 
 def test_a_tap_in_a_window_of_rest_is_no_lag() -> None:
@@ -28,7 +28,7 @@ def test_a_tap_in_a_window_of_rest_is_no_lag() -> None:
 
 
 def errors_of_short_passages(data: Path, settings: LagSettings) -> list[float]:
-    """Return lag errors divided by standard deviations, for 32 passages of 1 s of fast motion."""
+    """Return |lag error| / standard deviation for passages of 1 s, without refused passages."""
     recording = lag.excerpt(data, lag.FAST)
     body = rates_from_orientations(recording.t_ns, recording.optical, 0)
     rng = np.random.default_rng(1)
@@ -53,12 +53,13 @@ def test_the_standard_deviation_contains_the_stamp_error_of_a_short_passage(
     found = errors_of_short_passages(shared_data, LagSettings())
     assert len(found) >= 20
     assert max(found) < 4.0
-    # The residuals alone miss it.
+    # Without `stamp_sd_ns`, the standard deviation comes from the residuals alone, which do not
+    # show the stamp error.
     assert max(errors_of_short_passages(shared_data, LagSettings(stamp_sd_ns=0.0))) > 4.0
 
 
 def test_even_motion_averages_the_stamp_error(shared_data: Path) -> None:
-    """With ten seconds of even motion, the accuracy is that of vigorous motion."""
+    """Ten seconds of even motion determine the lag as accurately as vigorous motion."""
     recording = lag.excerpt(shared_data, lag.FAST)
     part = (recording.t_ns > 10e9) & (recording.t_ns < 20e9)
     imu = rates_from_gyro(recording.t_ns[part], recording.gyro[part], 0)

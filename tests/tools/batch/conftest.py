@@ -17,7 +17,11 @@ if TYPE_CHECKING:
 
 @pytest.fixture(scope="session", autouse=True)
 def process_tracker() -> None:
-    """Start the resource tracker of multiprocessing, whose pipe stays open until the exit."""
+    """Start the resource tracker of multiprocessing before the tests.
+
+    Its pipe remains open until the exit. If a test started the tracker, the check for open
+    descriptors would fail.
+    """
     resource_tracker.ensure_running()
 
 

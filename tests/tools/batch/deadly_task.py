@@ -1,4 +1,4 @@
-"""Replacement for the processing of a recording; the process waits, or dies."""
+"""Replacement for the processing of a recording, which waits or ends its process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`jointfit batch` at scale: a Dask cluster that loses a worker, and memory."""
+"""`jointfit batch` completes if a Dask worker is killed, and its memory does not grow."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(600)]
 
 
-@pytest.mark.filterwarnings("ignore")  # of distributed
+@pytest.mark.filterwarnings("ignore")  # the package distributed causes warnings
 def test_every_recording_is_processed_once_though_a_worker_is_killed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

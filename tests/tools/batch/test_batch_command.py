@@ -1,4 +1,4 @@
-"""`jointfit batch` as a user runs it: results, faults, stops and continuation."""
+"""`jointfit batch` equals the single commands; a fault or a stop affects one recording only."""
 
 from __future__ import annotations
 
@@ -136,7 +136,8 @@ def test_finished_recordings_are_not_processed_again(
     assert {p: p.stat().st_mtime_ns for p in out.rglob("report.html")} == before
     assert (out / "summary.csv").read_bytes() == summary
 
-    assert run(app, [*arguments, "--do", "export"]).exit_code == 0  # other steps: once more
+    # With other steps, the recordings are processed again.
+    assert run(app, [*arguments, "--do", "export"]).exit_code == 0
     assert not list(out.rglob("report.html"))
 
 
@@ -211,7 +212,7 @@ def test_wrong_options_are_named(tmp_path: Path, arguments: list[str], named: st
 
 
 class BreakingPool:
-    """A pool that is broken at its fifth task, while results of the others are ready."""
+    """Pool that breaks at the submission of the fifth task; the results of four tasks are ready."""
 
     def __init__(self, *_: object) -> None:
         self.submitted = 0

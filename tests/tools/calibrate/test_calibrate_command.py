@@ -1,4 +1,4 @@
-"""`jointfit calibrate` as a process, beside the real daemon: signals, lost terminals, progress."""
+"""`jointfit calibrate` with a real daemon reports progress, signals and the loss of a terminal."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ async def close_the_terminal(rig: Path, listener: Listener) -> None:
 async def request_twice(rig: Path, listener: Listener) -> None:
     leading = await calibrate(rig, *STATIC)
     await line_with(leading, "static:")
-    await line_with(leading, "%")  # progress, although there is no terminal
+    await line_with(leading, "%")  # progress is also printed without a terminal
 
     second = await calibrate(rig, *STATIC)
     output = await rest_of(second)
@@ -133,7 +133,7 @@ async def request_twice(rig: Path, listener: Listener) -> None:
 def test_progress_is_reported_at_the_start_of_a_phase_and_every_five_seconds() -> None:
     lines = ProgressLines()
     found = []
-    for tick in range(120):  # ten seconds and two, ten times a second
+    for tick in range(120):  # 12 s with ten ticks per second
         lines.update("static", tick / 120, "stand still")
         found += lines.due(100.0 + 0.1 * tick, {})
     assert found == ["static: 0 %, stand still", "static: 42 %, stand still",

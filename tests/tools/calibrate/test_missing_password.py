@@ -1,4 +1,4 @@
-"""`jointfit calibrate` refuses wrong options, and names the missing password of the broker."""
+"""`jointfit calibrate` refuses wrong durations, and names a missing password file of the broker."""
 
 from __future__ import annotations
 

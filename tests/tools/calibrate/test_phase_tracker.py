@@ -1,4 +1,4 @@
-"""Calibration phases followed over MQTT, and the lines printed for results and progress."""
+"""`PhaseTracker` finds the end of a phase in MQTT messages; results and progress become lines."""
 
 from __future__ import annotations
 
@@ -130,7 +130,8 @@ def test_movement_lines_contain_one_line_per_joint() -> None:
     knee = {"met": False, "source": "sensors", "predicted_error_mm": None, "bends": 3}
     ankle = {"met": False, "source": "unknown", "bends": 1}
     assert movement_lines({"joints": {"hip": hip, "knee": knee, "ankle": ankle}}) == [
-        "✔ hip: center ± 16.7 mm, random error 2.2 mm, 64° range",  # as in the target's text
+        # The random error is rounded up, as in the text of the daemon.
+        "✔ hip: center ± 16.7 mm, random error 2.2 mm, 64° range",
         "… knee: center unknown, 3 bends, from sensors",
         "… ankle: center unknown, 1 bend",
     ]
@@ -170,7 +171,7 @@ async def interrupted(phase: str, *states: Mapping[str, object]) -> object:
     waiting = asyncio.create_task(one.wait_for_end(phase))
     await asyncio.sleep(0)
     assert one.on_state("offline") == "the daemon is offline: waiting up to 60 s for it"
-    assert one.on_state("offline") is None  # reported once
+    assert one.on_state("offline") is None  # the state is reported only once
     for status in states:
         one.on_status(status)
     assert one.on_state("online") == "the daemon is online again"
@@ -179,7 +180,7 @@ async def interrupted(phase: str, *states: Mapping[str, object]) -> object:
 
 
 async def test_phase_goes_on_after_the_daemon_was_offline_briefly() -> None:
-    running = {"phase": "functional", "version": 1}  # the retained status, sent again
+    running = {"phase": "functional", "version": 1}  # the daemon sends its retained status again
     ended = {"phase": "calibrated", "version": None}
     assert await interrupted("functional", running, ended) is ended
 
@@ -215,7 +216,7 @@ async def test_state_of_the_daemon_between_phases_is_not_reported() -> None:
 
 
 class SilentDaemon:
-    """Replacement for a client whose requests are never answered."""
+    """Replacement for the MQTT client; no request receives an answer."""
 
     def __init__(self) -> None:
         self.asked: list[str] = []

@@ -1,4 +1,4 @@
-"""A simulated x-IMU3 with sensor errors, moved by a script as the guide requires."""
+"""A simulated x-IMU3 with sensor errors, which moves as `jointfit calibrate sensor` instructs."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def facing(up: np.ndarray) -> Rotation:
 
 
 def poses_at(seconds: float) -> Rotation:
-    """Return the orientation during the movements of the accelerometer step."""
+    """Return the orientation `seconds` after the start of the accelerometer step."""
     number, within = divmod(seconds, REST_S + MOVE_S)
     before, now = (
         facing(POSES[(int(number) + step) % len(POSES)]) if number + step >= 0 else facing(LEVEL)
@@ -94,19 +94,19 @@ def poses_at(seconds: float) -> Rotation:
 
 
 def turned_at(seconds: float) -> Rotation:
-    """Return the orientation of a sensor that is turned to all sides."""
+    """Return the orientation after `seconds` of a rotation to all sides."""
     return Rotation.from_euler("zyx", (0.9 * seconds, 2.1 * seconds, 3.3 * seconds))
 
 
 def movement(step: str, seconds: float) -> Rotation:
-    """Return the orientation of a step, some time after its instruction."""
+    """Return the orientation in a step, `seconds` after its instruction."""
     if step == "accelerometer":
         return poses_at(seconds)
     return turned_at(seconds) if step == "magnetometer" else facing(LEVEL)
 
 
 def recorded_chunks(steps: dict[str, float]) -> Iterator[Chunk]:
-    """Yield what the device sends while steps of given durations, s, are performed."""
+    """Yield the chunks that the device sends during the steps; `steps` contains durations, s."""
     signals, t_ns = InertialSignals(ERRORS), 0
     for step, seconds in steps.items():
         for k in range(round(seconds * RATE_HZ)):
@@ -129,7 +129,7 @@ class MovingHand:
         self._device, self._step, self._begin_ns = device, "gyroscope", time.monotonic_ns()
 
     def follow(self, line: str) -> None:
-        """Begin the next movement if the line is an instruction."""
+        """Begin the next movement if the line of output is an instruction."""
         words = {"accelerometer": "six faces", "magnetometer": "in your hand"}
         for step, word in words.items():
             if word in line:
@@ -147,7 +147,7 @@ class MovingHand:
 
 @asynccontextmanager
 async def held(folder: Path) -> AsyncIterator[MovingHand]:
-    """Write rig.toml, run a device, and yield the hand that moves the device."""
+    """Write rig.toml, run a device, and yield the `MovingHand` that moves the device."""
     (folder / "rig.toml").write_text(RIG.format(port=folder / "imu"), encoding="utf-8")
     stored = {
         "serial_mode": 1, "ahrs_message_rate_divisor": 0, "inertial_message_rate_divisor": 4,

@@ -1,4 +1,4 @@
-"""`jointfit calibrate sensor`: guided movements, and the table in rig.toml."""
+"""`jointfit calibrate sensor` finds the sensor errors, and changes only one table of rig.toml."""
 
 from __future__ import annotations
 
@@ -181,7 +181,7 @@ async def run_command(folder: Path, hand: Any, *options: str, stop_at: str = "")
     process = await asyncio.create_subprocess_exec(
         sys.executable, *COMMAND, "--rig", str(folder / "rig.toml"), *options,
         stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
-        # The tests themselves may run in the background of a shell that ignores SIGINT.
+        # Restore the default: if a shell runs the tests in the background, they ignore SIGINT.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     assert process.stdout is not None

@@ -1,4 +1,4 @@
-"""The command `jointfit center` as a user runs it, on trials with known center."""
+"""`jointfit center` finds the known center of simulated trials, and refuses unsuitable input."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ OPTIONS = ["--parent", "P1,P2,P3,P4", "--markers", "C1,C2,C3,C4"]
 
 
 def ball_trial(noise: float = 0.0005, frames: int = 400, span: float = 1.0) -> MarkerTrajectories:
-    """Return a ball joint that turns in all directions while the parent moves; y is up."""
+    """Return a trial of a ball joint that turns in all directions; the parent moves; y is up."""
     rng = np.random.default_rng(4)
     t = np.arange(frames) / 100.0
     parent = Rotation.from_rotvec(0.3 * np.stack((np.sin(t), np.cos(0.7 * t), 0.2 * t), axis=1))
@@ -47,7 +47,7 @@ def ball_trial(noise: float = 0.0005, frames: int = 400, span: float = 1.0) -> M
 
 
 def hinge_trial() -> MarkerTrajectories:
-    """Return a joint that turns about x only, with the parent at rest; y is up."""
+    """Return a trial of a joint that turns about x only, with the parent at rest; y is up."""
     rng = np.random.default_rng(4)
     t = np.arange(400) / 100.0
     turn = Rotation.from_rotvec(np.outer(0.8 * np.sin(2 * t), (1.0, 0.0, 0.0)))

@@ -1,4 +1,4 @@
-"""`jointfit center --segment … --trajectory` on chains whose joints are known in every frame."""
+"""`jointfit center --segment` finds all joints of simulated chains in every frame of a trial."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ MARKERS = {
     "C2": (2, (-0.02, -0.28)),
     "F": (3, (0.15, -0.04)),
 }
-"""Segment of each marker, and position relative to its proximal joint (pelvis: hip), m."""
+"""Index of the segment of each marker, and position of the marker relative to the proximal joint of
+the segment (for the pelvis: relative to the hip), m."""
 CHAIN = [
     *("--segment", "P", "--segment", "T1,T2", "--segment", "C1,C2", "--segment", "F"),
     *("--joints", "hip,knee,ankle", "--plane", "z"),
@@ -45,7 +46,7 @@ RATE_HZ, FRAMES = 50.0, 600
 def planar_chain(
     *, noise: float = 0.0005, moving: bool = True, seed: int = 1
 ) -> tuple[MarkerTrajectories, Array]:
-    """Return a planar chain in x and y (up), and its joints, m, shape (frames, 3, 2)."""
+    """Return a trial of a planar chain, y up, and its true joints, m, shape (frames, 3, 2)."""
     t = np.arange(FRAMES) / RATE_HZ
     scale = 1.0 if moving else 0.02
     bends = np.stack(
@@ -80,7 +81,7 @@ def reconstruct(folder: Path, trial: MarkerTrajectories, *options: str, code: in
 
 
 def positions(found: Any, key: str = "position_m") -> Array:
-    """Return positions or errors of all joints; null is NaN."""
+    """Return positions or errors of all joints; NaN replaces null."""
     return np.stack([np.array(joint[key], np.float64) for joint in found["joints"]], axis=1)
 
 
@@ -180,8 +181,8 @@ def test_all_joints_of_a_simulated_leg_are_found_in_space(tmp_path: Path) -> Non
     rms = np.sqrt(((positions(found) - truth) ** 2).sum(axis=2).mean(axis=0))
     assert rms[0] < 0.002
     assert rms[2] < 0.003
-    # Along the axis of the knee, no position is observable. Perpendicular to it, the thigh ends at
-    # the knee.
+    # The position of the knee along its axis is not observable. The distance between hip and knee
+    # may therefore be wrong, but it is constant.
     length = np.linalg.norm(positions(found)[:, 1] - positions(found)[:, 0], axis=1)
     assert length.std() < 0.002
 

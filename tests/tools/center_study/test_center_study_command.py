@@ -1,4 +1,4 @@
-"""`jointfit center-study` as a user runs it."""
+"""`jointfit center-study` prints tables with all limitations, and writes figures and JSON."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ def test_study_contains_its_setup_both_tables_and_every_limitation(tmp_path: Pat
     for text in CAVEATS:
         assert text in result.stdout
     cells = re.findall(r"-?\d\.\d\d/-?\d\.\d\d", result.stdout)
-    assert len(cells) == 2 * 3 * (1 + 5)  # two grids, three pairs, the printed one and five clips
+    # Each of two grids has rows for three pairs: the published value and five clipping limits.
+    assert len(cells) == 2 * 3 * (1 + 5)
     assert (out / "cor-study.txt").read_text("utf-8") == result.stdout
     for name in ("cor-study-figure-2", "cor-study-estimators"):
         assert (out / f"{name}.png").read_bytes().startswith(b"\x89PNG")

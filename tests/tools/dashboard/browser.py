@@ -80,7 +80,7 @@ class OpenedPage:
 
 @contextlib.asynccontextmanager
 async def chromium() -> AsyncIterator[Browser]:
-    """Yield a browser; skip the test where there is none."""
+    """Yield a browser; skip the test if Chromium or Playwright is not installed."""
     program = shutil.which("chromium")
     if program is None:
         pytest.skip("chromium is not installed (Debian: apt install chromium)")

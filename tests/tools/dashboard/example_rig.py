@@ -1,4 +1,4 @@
-"""A published rig with the limb of a configuration: any number of segments, and two branches."""
+"""A published rig with the limb of any rig.toml, which may have many segments or two branches."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import orjson
-from typing_extensions import override  # typing has it from Python 3.12
+from typing_extensions import override  # typing contains `override` from Python 3.12
 
 from jointfit_daemon.config import load_rig
 from jointfit_daemon.outputs.payloads._topic_writer import _info
@@ -30,7 +30,7 @@ ANGLES = {
 
 @dataclass
 class ExampleRig(PublishedRig):
-    """Payloads of a rig.toml; every joint swings."""
+    """Payloads of the rig in `file`; every joint swings."""
 
     file: Path = EXAMPLES / "knee.toml"
 

@@ -1,7 +1,7 @@
 """A rig that publishes the topics of a calibrated leg, without daemon, sensors and simulator.
 
-Tests of the page use it if they need no calibration, because it starts at once and needs no CPU
-time.
+Tests of the page use this rig if they need no calibration, because it starts at once and needs
+little CPU time.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ STOPPED = {
     "file": "", "duration_s": 0.0, "written_bytes": 0, "lost": 0, "failure": None,
     "free_bytes": 93_200_000_000, "active": False,
 }  # fmt: skip
-"""State of the recording if there is none."""
+"""State of the recording before the first start."""
 
 
 @dataclass
@@ -196,7 +196,7 @@ class PublishedRig:
         return self.recording | {"duration_s": duration_s, "written_bytes": size}
 
     def reply(self, command: str, request: dict[str, Any]) -> dict[str, Any]:
-        """Return the answer to a request; `record` and `mark` have their effect."""
+        """Return the answer to a request; `record` and `mark` change the state of the recording."""
         if command in self.answers:
             return self.answers[command]
         if command not in ("record", "mark") or self.answer["status"] == "error":
@@ -317,13 +317,14 @@ class PublishedRig:
 
 @contextlib.asynccontextmanager
 async def publishing(rig: PublishedRig, port: int) -> AsyncIterator[None]:
-    """Publish the topics of a rig during the block; reconnect like the daemon."""
+    """Publish the topics of a rig during the ``with`` block; reconnect like the daemon."""
     task = asyncio.create_task(_publish(rig, port), name="published rig")
     try:
         yield
     finally:
-        # Until Python 3.12 asyncio.wait_for discards a cancellation if its future completes in the
-        # same step, and an error while the client disconnects replaces it: cancel until it ends.
+        # A task can lose its cancellation: before Python 3.12, asyncio.wait_for discards it if the
+        # awaited future completes at the same time, and an error of the client during disconnection
+        # replaces it. Therefore cancel the task until it ends.
         while not task.done():
             task.cancel()
             await asyncio.wait([task], timeout=1.0)

@@ -1,4 +1,4 @@
-"""The dashboard's page on a rig that only publishes, for tests."""
+"""The dashboard's page with a `PublishedRig`, for tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Requests that a user starts in the dashboard's page, and the check of axes."""
+"""The dashboard's page sends the requests of its menu, and guides through the checks of sensors."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ CASES: list[tuple[str, str, dict[str, Any], tuple[str, ...]]] = [
     ("Self-test", "selftest", {}, ("1 of 2 checks passed", "98 % full", "delete old recordings")),
     ("Reload rig.toml", "reload", {}, ("2 faults in rig.toml", "mqtt.port", "rig.name")),
 ]
-"""Entry of the menu, command, arguments, and parts of the text shown."""
+"""Entry of the menu, command, arguments, and parts of the displayed answer."""
 
 
 def sent(rig: PublishedRig) -> dict[str, Any]:
@@ -66,7 +66,7 @@ async def test_each_entry_of_the_menu_sends_its_request_and_shows_the_answer(
                 for value in arguments.values():
                     await page.page.fill("#action input", str(value))
                 if command != "selftest":
-                    assert sent_count(rig, command) == 0  # not before the confirmation
+                    assert sent_count(rig, command) == 0  # the confirmation is missing
                     await page.page.click("#action .primary")
                 for part in parts:
                     await page.until_text("#action .answer", part)
@@ -181,5 +181,5 @@ async def test_the_physical_test_guides_step_by_step_and_ends_with_lines_for_rig
         assert await page.accessibility_faults() == []
         await page.picture(f"physical-test-outcome-{size}-{scheme}")
         width = await page.page.evaluate("document.documentElement.scrollWidth - innerWidth")
-        assert width <= 0  # nothing to scroll sideways
+        assert width <= 0  # the page is not wider than the window
         assert page.errors == []

@@ -1,4 +1,4 @@
-"""The dashboard's web server at the level of HTTP: methods, tags, targets, and hostile requests."""
+"""The dashboard's web server answers every HTTP request, even malformed requests, as specified."""
 
 from __future__ import annotations
 
@@ -40,7 +40,10 @@ def respond(
 
 
 async def sent(request: bytes, *, end: bool = False) -> bytes:
-    """Return all bytes with which a server answers to `request`; with `end`, nothing follows it."""
+    """Send `request` to a server; return all bytes of the answer.
+
+    With `end`, the client closes its sending side after the request.
+    """
     async with SERVER.listening(LISTEN) as url, asyncio.timeout(5):
         port = int(url.rstrip("/").rpartition(":")[2])
         reader, writer = await asyncio.open_connection(HOST, port)
@@ -155,7 +158,10 @@ def test_no_request_fails_or_returns_anything_but_the_page(
 @given(st.binary(max_size=300), st.booleans())
 @settings(max_examples=40, deadline=None)
 def test_bytes_that_are_no_request_end_in_a_closed_connection(noise: bytes, after: bool) -> None:
-    """A server that fails answers 500 or does not close; `sent` then times out."""
+    """The server neither answers with status 500 nor leaves the connection open.
+
+    If the connection remained open, `sent` would raise `TimeoutError`.
+    """
     request = b"GET / HTTP/1.1\r\nHost: localhost\r\n" + noise + b"\r\n\r\n" if after else noise
     answer = asyncio.run(sent(request, end=True))
     assert not answer.startswith(tuple(f"HTTP/1.1 {code}".encode() for code in FORBIDDEN))

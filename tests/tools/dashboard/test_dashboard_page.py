@@ -1,4 +1,4 @@
-"""The dashboard's page in Chromium with a published rig: drawing, texts and recovery."""
+"""The dashboard's page in Chromium draws a published rig, explains its state, and reconnects."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ TICKS = "[...document.querySelectorAll('.rail .done .rail-title')].map((each) =>
                 "phase": "static",
                 "version": 3,
                 "done": ["static"],
-            },  # repeated for an active one
+            },  # the pose is repeated while version 3 is active
             ["Align", "Move"],
         ),
     ],

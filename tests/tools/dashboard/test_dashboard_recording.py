@@ -1,4 +1,4 @@
-"""The recording in the dashboard's page: its state, and the buttons and the key that control it."""
+"""The dashboard's page shows the state of the recording, and controls the recording."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ async def test_a_recording_is_started_marked_and_stopped_by_the_keyboard(broker:
         assert await page.page.evaluate(f"document.activeElement.matches('{STOP}')")
 
         await page.page.fill("#recording input", "step")
-        for _ in range(2):  # the text stays for a repetition
+        for _ in range(2):  # the text remains in the field, so Enter repeats the mark
             await keyboard.press("Enter")
         await page.until_text("#recording [role=status]", "Mark 2 at")
         assert sent(rig, "mark") == [{"text": "step"}, {"text": "step"}]
@@ -51,7 +51,7 @@ async def test_a_recording_is_started_marked_and_stopped_by_the_keyboard(broker:
         await page.page.focus(STOP)
         await keyboard.press("Enter")
         await page.until_text("#action", "not recorded")
-        assert sent(rig, "record") == [{"action": "start"}]  # not before the confirmation
+        assert sent(rig, "record") == [{"action": "start"}]  # the stop is not confirmed yet
         await page.page.focus("#action .primary")
         await keyboard.press("Enter")
         await page.until_text("#action .answer", "nothing lost")
@@ -87,7 +87,8 @@ async def test_one_key_marks_in_every_view_but_not_while_typing(broker: Broker) 
         await page.until_text("#toast", "Mark 2 at")
         assert sent(rig, "mark") == [{"text": "mark"}, {"text": "mark"}]
 
-        await page.page.uncheck("#mark-key")  # for speech input, which types letters
+        # Users of speech input, which types letters, can turn off the key M.
+        await page.page.uncheck("#mark-key")
         await page.page.wait_for_function(BLANK, timeout=10_000)
         await page.page.keyboard.press("m")
         await page.page.reload()

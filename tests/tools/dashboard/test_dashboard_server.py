@@ -1,4 +1,4 @@
-"""The dashboard's web server: files, security headers, and the tunnel to real brokers."""
+"""The dashboard's web server sends files with security headers, and tunnels to real brokers."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ async def test_no_path_leaves_the_folder_of_the_page(path: str) -> None:
      ("Localhost:1", 200), ("[::1]:8080", 200), ("rig.lab", 200)],
 )  # fmt: skip
 async def test_the_server_answers_to_its_own_names_only(host: str, status: int) -> None:
-    """Names of other sites that resolve to this machine are refused, as they share the origin."""
+    """A request with the host name of another site is refused, even if it reaches this machine."""
     async with DashboardServer(NOWHERE, names=("rig.lab",)).listening(LISTEN) as url:
         assert (await get(url, Host=host))[0] == status
 
@@ -305,7 +305,7 @@ async def test_the_command_prints_its_url_and_the_missing_broker_and_stops_with_
         *shell, sys.executable, "-m", "jointfit_daemon.tools.__main__", "dashboard",
         "--listen", f"{HOST}:0", "--broker", f"mqtt://{HOST}:{free_port()}",
         stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
-        # The tests themselves may run in the background of a shell that ignores SIGINT.
+        # Restore the default: if a shell runs the tests in the background, they ignore SIGINT.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     assert process.stdout is not None

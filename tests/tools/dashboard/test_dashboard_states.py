@@ -1,4 +1,4 @@
-"""Faults that the dashboard's page explains: brokers, permissions, versions, clocks, rigs."""
+"""The dashboard's page names faults of brokers, permissions and clocks, and draws every limb."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ ACCOUNTS = {"jointfitd": "d", "viewer": "v", "half": "h"}
 
 @pytest.fixture
 def restricted(tmp_path: Path, start_mosquitto: Callable[[str], Broker]) -> Broker:
-    """Return a mosquitto with accounts and the access list of the documentation."""
+    """Return a mosquitto broker with accounts and the access list of the documentation."""
     passwords, rights = tmp_path / "passwords", tmp_path / "rights"
     passwords.touch()
     for name, password in ACCOUNTS.items():

@@ -1,4 +1,4 @@
-"""TLS of the dashboard: towards browsers, towards the broker, and the refusals in words."""
+"""The dashboard uses TLS for browsers and brokers, and gives the reason of each refusal."""
 
 from __future__ import annotations
 
@@ -46,7 +46,11 @@ def issue(folder: Path, name: str, *more: str) -> None:
 
 @pytest.fixture(scope="session")
 def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with certificates: of this machine, of another, and one with a passphrase."""
+    """Return a folder with three certificates and keys.
+
+    They are for this machine (``here``), for another host (``elsewhere``), and with a passphrase
+    (``locked``).
+    """
     if shutil.which("openssl") is None:
         pytest.skip("openssl is not installed (Debian: apt install openssl)")
     folder = tmp_path_factory.mktemp("certificates")
@@ -148,7 +152,7 @@ async def test_the_page_and_its_tunnel_are_served_by_https(
 def test_faulty_certificates_are_named_with_what_is_expected(
     certificates: Path, words: tuple[str, ...], expected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.delattr("os.execv")  # a server in place of the tests would run forever
+    monkeypatch.delattr("os.execv")  # otherwise a server could replace the process of the tests
     files = [str(certificates / word) if "." in word else word for word in words]
     result = CliRunner().invoke(app, ["dashboard", "--listen", f"{HOST}:0", *files])
     assert result.exit_code == 2

@@ -1,4 +1,4 @@
-"""The picture of the demo in terminals of several sizes."""
+"""The display of the demo fits into terminals of several sizes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def shown(width: int, *, height: int = 24, frames: int = 5000) -> list[str]:
 @pytest.mark.parametrize("width", [200, 120, 80, 60, 50])
 def test_display_fits_24_lines_at_any_width(width: int) -> None:
     lines = shown(width)
-    assert len(lines) <= 23  # the cursor has the last one
+    assert len(lines) <= 23  # the cursor needs line 24
     assert max(map(len, lines)) <= width
     for step in STEPS:
         assert any(step in line for line in lines)

@@ -1,4 +1,4 @@
-"""Result line of the demo: complete, partial, and after Ctrl-C."""
+"""The demo always ends with a result line, even after a failed step or Ctrl-C."""
 
 from __future__ import annotations
 

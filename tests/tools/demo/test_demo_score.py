@@ -1,4 +1,4 @@
-"""Ground truth interpolation, errors against it, and targets of the demo."""
+"""The demo interpolates the ground truth, computes RMS errors, and names missed targets."""
 
 from __future__ import annotations
 

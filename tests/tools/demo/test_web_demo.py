@@ -1,4 +1,7 @@
-"""`jointfit demo --web`: the URL comes first, with a QR code where a phone can use it."""
+"""`jointfit demo --web` first prints the URL, with a QR code if other devices can open the page.
+
+After that it repeats phases that a busy computer ended.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +55,8 @@ async def test_the_page_answers_before_the_hardware_starts_and_ctrl_c_ends_with_
     assert process.stdout is not None
     async with asyncio.timeout(PATIENCE_S):
         url = (await process.stdout.readline()).decode().split()[1]
-        assert cpu_s(process.pid) < 1.0  # the time until the URL on a machine without other load
+        # The CPU time does not depend on the load of the machine, unlike the time until the URL.
+        assert cpu_s(process.pid) < 1.0
         page = await asyncio.to_thread(lambda: urllib.request.urlopen(url).read())
         assert b"jointfitd" in page
         await process.stdout.readline()
@@ -62,7 +66,7 @@ async def test_the_page_answers_before_the_hardware_starts_and_ctrl_c_ends_with_
 
 
 class AbortingDaemon:
-    """A client whose daemon aborts the first phases with given reasons, and completes the next."""
+    """Client of a daemon that aborts phases with the given reasons, and then completes a phase."""
 
     def __init__(self, *reasons: str) -> None:
         self.tracker = PhaseTracker(lambda *_: None)

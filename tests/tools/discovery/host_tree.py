@@ -1,4 +1,4 @@
-"""Trees of sysfs, procfs and /dev as on a gateway with hardware that the test machine lacks."""
+"""Folders that imitate sysfs, procfs and /dev of a gateway, for hardware that a test cannot use."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def add_port(
     by_id: str | None = None,
     number: int = 0,
 ) -> None:
-    """Add a USB adapter as the kernel shows it: port, interface and USB device in one path."""
+    """Add a USB adapter as in sysfs: the path contains USB device, interface and port."""
     usb = root / f"sys/devices/pci0000:00/usb1/1-{number + 1}"
     port = usb / f"1-{number + 1}:1.0" / name
     write(usb / "idVendor", vendor)
@@ -53,7 +53,7 @@ def add_port(
 
 
 def add_can(root: Path, name: str, *, up: bool = True, driver: str | None = "gs_usb") -> None:
-    """Add a CAN interface; one without driver is virtual."""
+    """Add a CAN interface; without `driver`, the interface is virtual."""
     folder = root / "sys/class/net" / name
     write(folder / "type", 280)
     write(folder / "flags", "0x40041" if up else "0x40080")

@@ -1,4 +1,4 @@
-"""Devices of a host are found from the kernel's files, without opening one."""
+"""The devices of a host are found in the kernel's files; no device is opened."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_port_without_links_or_usb_is_found_by_its_device_file(tmp_path: Path)
 
 
 def test_consoles_and_reserved_names_without_hardware_are_not_ports(tmp_path: Path) -> None:
-    write(tmp_path / "sys/class/tty/tty1/dev", "4:1")  # console
+    write(tmp_path / "sys/class/tty/tty1/dev", "4:1")  # a console
     hardware = tmp_path / "sys/devices/platform/serial8250"
     write(hardware / "uevent", "")
     write(tmp_path / "sys/class/tty/ttyS3/type", 0)  # PORT_UNKNOWN

@@ -1,4 +1,4 @@
-"""Listening on a port or an interface names the driver whose decoder reads what arrives."""
+"""Reception on a port or a CAN interface finds the drivers that decode the received data."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ LISTEN_S = 0.4
 
 @pytest.fixture
 async def streaming(tmp_path: Path) -> AsyncIterator[str]:
-    """The port of an IMU that sends 100 samples a second."""
+    """Yield the port of an IMU that sends 100 samples per second."""
     device = XbusDevice(tmp_path / "imu", options=XbusDeviceOptions(measures_at_once=True))
 
     async def push() -> None:
@@ -117,14 +117,15 @@ def test_noise_with_an_accidental_message_is_no_device() -> None:
 
 
 def test_a_device_without_orientations_is_recognized_by_its_messages() -> None:
-    wire = encode(0x36, bytes([0x10, 0x20, 2, 0, 1])) * 20  # MTData2 with a packet counter only
+    # Messages MTData2 that contain only a packet counter.
+    wire = encode(0x36, bytes([0x10, 0x20, 2, 0, 1])) * 20
     found = decode_traffic(XbusImu, "xbus", {"baud": 115_200}, [Chunk(0, wire)])
     assert found is not None
     assert (found.messages, found.samples, found.rate_hz) == (20, 0, None)
 
 
 class _Bus:
-    """Wire that collects the frames of simulated sensors."""
+    """CAN bus that collects the frames of simulated sensors."""
 
     bitrate = None
     is_open = True
@@ -152,7 +153,7 @@ def test_sensors_on_one_bus_are_separated_by_their_identifiers(
     frames = sorted(sensor_frames(0) + sensor_frames(0x100), key=lambda frame: frame.t_ns)
     received = [(frame.t_ns, frame.can_id, frame.data) for frame in frames]
     received.append((1, 0x123 | 1 << 31, b"foreign"))
-    received.append((2, 1 << 29 | 4, bytes(8)))  # error frame of the controller
+    received.append((2, 1 << 29 | 4, bytes(8)))  # an error frame of the controller
     monkeypatch.setattr(can_listening, "_receive", lambda *_: received)
 
     found = listen_can("can0")

@@ -1,4 +1,4 @@
-"""`jointfit doctor` names the family behind a serial port, and sends nothing to it."""
+"""`jointfit doctor` names the sensor family on a serial port, and sends nothing to the sensor."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def source(folder: Path, driver: str, **keys: Any) -> Source:
 async def finding(
     folder: Path, options: XbusDeviceOptions, driver: str, monkeypatch: Any, **keys: Any
 ) -> Finding:
-    """Return the finding about a sending device, to which nothing may be written."""
+    """Return the finding about a device that sends data; require that nothing is sent to it."""
     monkeypatch.setattr(_device_checks, "_LISTEN_S", 0.3)
     device = XbusDevice(folder / "imu", options=options)
     monkeypatch.setattr(device, "_receive", lambda data: pytest.fail(f"received {data!r}"))

@@ -1,4 +1,4 @@
-"""`jointfit doctor` with a real broker and a simulated server of motion capture."""
+"""`jointfit doctor` finds faults of a real broker and of a simulated motion-capture server."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ POSE = ((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0))
 
 @contextmanager
 def cameras() -> Iterator[NatNetServer]:
-    """A server that sends frames, in a thread with an event loop of its own."""
+    """Yield a server that sends mocap frames, in a thread with its own event loop."""
     bodies = (RigidBodyAsset("Thigh", ("T1",), 1), RigidBodyAsset("Shank", ("S1",), 2))
     server = NatNetServer(NatNetServerOptions(bodies))
     stop = threading.Event()
@@ -173,7 +173,8 @@ def test_the_json_of_this_host_follows_its_schema_and_decides_the_exit_code(
     tmp_path: Path,
 ) -> None:
     path = rig_file(tmp_path, free_port(), free_port())
-    code, text = printed(["--json", "--wait", "0.5"], tmp_path)  # rig.toml is in the folder
+    # The command uses the rig.toml in the working directory.
+    code, text = printed(["--json", "--wait", "0.5"], tmp_path)
     report = orjson.loads(text)
     jsonschema.validate(report, TypeAdapter(DoctorReport).json_schema(mode="serialization"))
     assert (code, report["level"]) == (1, "error")

@@ -1,4 +1,4 @@
-"""Each fault of ports, interfaces and host yields a finding; a host without faults has none."""
+"""Each fault of ports, CAN interfaces and host yields a warning, an error or a note."""
 
 from __future__ import annotations
 
@@ -286,7 +286,7 @@ def test_the_facts_of_this_host_are_read_without_root() -> None:
 
 def test_a_real_pseudo_terminal_is_held_by_this_process_which_is_no_fault(tmp_path: Path) -> None:
     controller, line = os.openpty()
-    (tmp_path / "imu").symlink_to(os.ttyname(line))  # as jointfit-sim does
+    (tmp_path / "imu").symlink_to(os.ttyname(line))  # jointfit-sim creates such a link
     holders = Host().holders(Path(os.ttyname(line)))
     (found,) = check_serial(Host(), [str(tmp_path / "imu")])
     os.close(controller)

@@ -1,4 +1,4 @@
-"""Trials as files for `jointfit fuse`: a leg with soft-tissue artefact, standing and moving."""
+"""Files of simulated trials for `jointfit fuse`: a leg with soft-tissue artefact, and its pose."""
 
 from __future__ import annotations
 
@@ -37,13 +37,16 @@ def run(*arguments: object) -> Any:
 
 
 def said(result: Any) -> str:
-    """Return the text on stderr of a refused command, on one line."""
+    """Return the text that a refused command printed on stderr, as one line."""
     assert result.exit_code == 2, result.output
     return " ".join(result.stderr.split())
 
 
 def limb(k: int) -> tuple[Array, Array]:
-    """Return thigh and shank of movement `k`, shape (N, 4); both upright in the first frame."""
+    """Return the orientations of thigh and shank in movement `k`, shape (N, 4) each.
+
+    Both segments are upright in the first frame.
+    """
     t = np.arange(N) / RATE_HZ
     swing = (0.4 + 0.1 * k) * np.sin((1.0 + 0.3 * k) * t)
     bend = -(0.5 + 0.2 * k) * (1.0 - np.cos((1.4 + 0.2 * k) * t))
@@ -101,9 +104,10 @@ def as_trc(
     scale: float = 1.0,
     stretch: float = 1.0,
 ) -> None:
-    """Write markers on the bones, sampled at another rate, y up.
+    """Write markers on the bones with the rate `rate_hz`, y up.
 
-    `scale` is the factor of the unit of the file, `stretch` that of the distances of the markers.
+    The file contains all positions multiplied by `scale`. The distances between the markers of a
+    segment are multiplied by `stretch`.
     """
     t_s = np.arange(0.0, trial.t_s[-1], 1.0 / rate_hz)
     names, positions = [], []
@@ -114,7 +118,7 @@ def as_trc(
         q = rotation.interpolate(q[at], q[at + 1], share)
         names += [f"{segment}{k}" for k in range(3)]
         moved = rotation.rotate(q[:, None], stretch * places) + np.array((1.0, 2.0, 1.0))
-        positions.append(moved[..., [1, 2, 0]])  # z up to y up: (x, y, z) was (z, x, y)
+        positions.append(moved[..., [1, 2, 0]])  # convert z up to y up
     frames = np.arange(1, len(t_s) + 1)
     seen = scale * np.concatenate(positions, axis=1)
     write_trc(path, MarkerTrajectories(tuple(names), t_s, frames, seen, rate_hz))

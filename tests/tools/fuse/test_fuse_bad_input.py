@@ -1,7 +1,4 @@
-"""Unusual input of `jointfit fuse`: a clear error message, or a right fit.
-
-Every error message names the object and the remedy.
-"""
+"""`jointfit fuse` processes unusual input correctly, or names the faulty object and the remedy."""
 
 from __future__ import annotations
 
@@ -74,7 +71,7 @@ def test_a_reference_missing_half_of_the_time_suffices_for_training(files: Path)
     for segment in ("thigh", "shank"):
         assert found["m2", "anchored"][segment] < 0.7 * found["m2", "mean"][segment]
     frames = rows(run("evaluate", files / "h0.npz", files / "m1.npz", *LIMB, "--json"))
-    assert frames["h0", "mean"]["frames"] == N // 2  # only evaluated frames
+    assert frames["h0", "mean"]["frames"] == N // 2  # the frames with a reference
 
 
 def test_trial_without_evaluation_frames_is_reported(files: Path) -> None:
@@ -140,7 +137,7 @@ def test_trial_without_reference_is_rejected_with_a_remedy(files: Path) -> None:
 
 
 def test_sensors_and_bones_of_one_name_are_kept_apart(files: Path) -> None:
-    """A file may use the name ``thigh`` for a sensor and for a bone; both are distinguished."""
+    """A sensor and a bone of one file may both have the name ``thigh``."""
     trial = movement()
     sensors = {"thigh": trial.sensors["A"], "shank": trial.sensors["C"]}
     rewrite(files, "same", OrientationTrial(trial.t_s, sensors, trial.bones, {}))

@@ -1,4 +1,4 @@
-"""`jointfit fuse` on files: evaluation, output files, and messages about wrong files."""
+"""`jointfit fuse` evaluates, fits and applies methods to files, and rejects wrong files."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_a_single_trial_is_evaluated_on_its_last_part(files: Path) -> None:
 
 
 def test_evaluation_uses_frames_that_were_not_fitted(files: Path) -> None:
-    """A trial with a wrong reference affects its own row, and others through training only."""
+    """A trial with a wrong reference has a large error, because its own fit did not use it."""
     spoiled = movement(2)
     turned = rotation.multiply(spoiled.bones["thigh"], rotation.exp(np.array((1.0, 0, 0))))
     write_orientations_npz(
@@ -106,7 +106,7 @@ def test_the_semireal_squats_reproduce_their_published_figures(shared_data: Path
 
 @cache
 def model_text(folder: Path, method: str) -> str:
-    """Return the model of the three trials, which are equal in every folder."""
+    """Return the text of the model that `method` yields for the three trials in `folder`."""
     static = ["--static", folder / "still.npz", "--method", method]
     result = run("fit", *trials(folder), *LIMB, *static, "--out", folder / "fit.json")
     assert result.exit_code == 0, result.output
@@ -208,13 +208,13 @@ def test_missing_sensor_is_reported_and_the_others_are_fused(
 
 @cache
 def figures_of_npz(folder: Path) -> dict[tuple[str, str], Any]:
-    """Return the results of two trials, which are equal in every folder."""
+    """Return the errors of all methods on two trials in `folder`, by trial and method."""
     options = [*LIMB, "--static", folder / "still.npz", "--json"]
     return rows(run("evaluate", *trials(folder, 2), *options))
 
 
 def as_sto(path: Path, trial: OrientationTrial, *, bones: bool, up: str = "z") -> None:
-    """Write the orientations of sensors or bones as OpenSim does."""
+    """Write the orientations of sensors or bones as an STO file of OpenSim."""
     columns = trial.bones if bones else trial.sensors
     q = np.stack(list(columns.values()), axis=1)
     q = q[..., [0, 2, 3, 1]] if up == "y" else q

@@ -1,6 +1,6 @@
-"""Joint positions and the angles of the patent in the output of `jointfit fuse apply`.
+"""`jointfit fuse apply` writes correct joint positions, and the joint angles of the patent.
 
-The expected values are computed with SciPy rotations and with explicit quaternion products.
+The tests compute the expected values with SciPy rotations and with explicit quaternion products.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def mean_model(lengths: tuple[tuple[str, float], ...] = ()) -> Calibration:
 
 
 def recorded(thigh: Array, shank: Array) -> OrientationRecording:
-    """Return a recording at 100 Hz of sensors with the orientations of their segments."""
+    """Return a recording at 100 Hz in which sensors have the orientations of their segments."""
     q = {"A": thigh, "B": thigh, "C": shank, "D": shank}
     return OrientationRecording(np.arange(len(thigh)) / 100.0, q, {})
 
@@ -72,13 +72,20 @@ def product(a: Array, b: Array) -> Array:
 
 
 def below(origin: Array, q: Array, length: float) -> Array:
-    """Return P + q (0, 0, 0, -L) q* (step S5 of the patent), z from distal to proximal."""
+    """Return the position of the distal joint, P + q (0, 0, 0, -L) q* (step S5 of the patent).
+
+    P is the position `origin` of the proximal joint, q the orientation of the segment with z from
+    distal to proximal, and L its length.
+    """
     along = np.tile((0.0, 0.0, 0.0, -length), (len(q), 1))
     return origin + product(product(q, along), q * (1.0, -1.0, -1.0, -1.0))[:, 1:]
 
 
 def euler(above: Array, distal: Array) -> Array:
-    """Return alpha, beta, gamma of R = Rz(gamma) Ry(beta) Rx(alpha), rad."""
+    """Return the angles alpha, beta, gamma of a joint, rad, shape (N, 3).
+
+    The joint rotation is R = Rz(gamma) Ry(beta) Rx(alpha).
+    """
     joint = Rotation.from_quat(above[:, [1, 2, 3, 0]]).inv() * Rotation.from_quat(
         distal[:, [1, 2, 3, 0]]
     )
@@ -181,7 +188,7 @@ def test_all_formats_contain_the_same_positions_and_patent_angles(
         ankle, patent = arrays["position_ankle"], np.rad2deg(arrays["patent_knee"])
         gimbal, sd = arrays["patent_gimbal_knee"], arrays["sd_position_ankle"]
 
-    # CSV files have z up
+    # In a CSV file, z is up.
     with (tmp_path / "r.csv").open() as text:
         table = list(csv.DictReader(text))
     written = np.array([[float(row[f"ankle_{axis}_m"]) for axis in "xyz"] for row in table])
@@ -189,7 +196,7 @@ def test_all_formats_contain_the_same_positions_and_patent_angles(
     assert float(table[7]["knee_patent_gamma_deg"]) == pytest.approx(patent[7, 2], abs=1e-6)
     assert {row["knee_patent_gimbal"] for row in table} == {"0"} == {f"{x:g}" for x in gimbal}
 
-    # STO and MOT files with y up: x forward, z to the right
+    # In these STO and MOT files, y is up, x forward, and z to the right.
     positions, both = read_sto(tmp_path / "r_positions.sto"), read_sto(tmp_path / "r.mot")
     angles = read_sto(tmp_path / "r_angles.sto")
     assert (positions.in_degrees, angles.in_degrees, both.in_degrees) == (False, True, True)
@@ -224,7 +231,7 @@ def test_no_position_is_written_without_the_first_length(files: Path, tmp_path: 
 
 
 def write_gap(path: Path, shank: slice, thigh: slice) -> Path:
-    """Write the trial with missing sensors of each segment in some frames."""
+    """Write a trial without sensor data of the shank and of the thigh in the given frames."""
     trial = movement(1)
     for name in "ABCD":
         trial.sensors[name][thigh if name in "AB" else shank] = np.nan
@@ -238,7 +245,8 @@ def test_frames_with_unknown_values_are_left_out_of_opensim_files(
 ) -> None:
     opensim = pytest.importorskip("opensim", reason="opensim is not installed")
     opensim.Logger.setLevelString("off")
-    # The fusion repeats an orientation for 10 frames (0.2 s).
+    # If all sensors of a segment are missing, the fusion repeats its last orientation for 10 frames
+    # (0.2 s). The two gaps together therefore omit only 30 frames.
     gap = write_gap(tmp_path / "gap.npz", np.s_[50:80], np.s_[60:90])
     out = tmp_path / f"r.{ending}"
     result = run("apply", files / "model.json", gap, "--out", out, *LENGTHS)
@@ -352,7 +360,7 @@ def test_a_fit_stores_lengths_between_bone_origins_and_those_of_options(tmp_path
     knee = np.zeros((N, 3))
     knee[:, 2] = -0.42 + 0.002 * rng.normal(size=N)
     knee[:5] = np.nan
-    knee[5:10, 2] = -9.0  # outliers
+    knee[5:10, 2] = -9.0  # these values are outliers
     write_with_origins(tmp_path / "t.npz", movement(), knee)
     found = fit(tmp_path, "--length", "shank=0.39")
     assert found["thigh"]["length"] == pytest.approx(0.42, abs=0.0005)

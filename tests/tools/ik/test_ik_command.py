@@ -1,4 +1,4 @@
-"""The command `jointfit ik` as a user runs it."""
+"""`jointfit ik` recovers the coordinates of simulated trials, and refuses unsuitable trials."""
 
 from __future__ import annotations
 
@@ -235,7 +235,7 @@ def test_only_the_frames_of_the_time_range_are_solved(folder: Path) -> None:
 
 def test_unknown_coordinates_are_left_out_of_opensim_files_and_empty_in_csv(folder: Path) -> None:
     def hidden(y: Array) -> Array:
-        y[3, 8:] = np.nan  # the shank
+        y[3, 8:] = np.nan  # hide the shank
         y[4] = np.nan
         return y
 
@@ -254,7 +254,7 @@ def test_unknown_coordinates_are_left_out_of_opensim_files_and_empty_in_csv(fold
 
 def test_a_coordinate_known_in_few_frames_does_not_empty_the_table(folder: Path) -> None:
     def hidden(y: Array) -> Array:
-        y[1:, 8:] = np.nan  # the shank, except in the first frame
+        y[1:, 8:] = np.nan  # hide the shank, except in the first frame
         y[25:] = np.nan
         return y
 
@@ -273,8 +273,8 @@ def test_a_coordinate_known_in_few_frames_does_not_empty_the_table(folder: Path)
 
 def test_a_table_without_a_complete_frame_is_a_failure(folder: Path) -> None:
     def hidden(y: Array) -> Array:
-        y[::2, 8:] = np.nan  # the shank
-        y[1::2, :4] = np.nan  # the pelvis
+        y[::2, 8:] = np.nan  # hide the shank
+        y[1::2, :4] = np.nan  # hide the pelvis
         return y
 
     write_trial(folder, hidden)

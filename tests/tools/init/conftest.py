@@ -1,4 +1,4 @@
-"""Fixtures of the tests of `jointfit init`."""
+"""Fixtures that replace the search for installed drivers in the tests of `jointfit init`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jointfit_daemon.tools.init import _search
 
 @pytest.fixture(autouse=True)
 def fast_drivers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Search the installed packages for drivers once, because each answer causes a check."""
+    """Search the installed packages for each driver only once, instead of after each answer."""
     monkeypatch.setattr(_load, "find_driver", cache(driver.find_driver))
 
 

@@ -1,4 +1,4 @@
-"""Random dialogues: found devices, and answers of every kind to each question."""
+"""Random dialogues of `jointfit init`: found devices, and answers of every type to a question."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NOTHING = Found(
     ),
     mocap_drivers=(MocapDriver("natnet", 1510),),
 )
-"""Drivers without any found device."""
+"""Result of a search that found drivers, but no device."""
 DEVICES = replace(
     NOTHING,
     ports=tuple(FoundDevice(f"/dev/ttyUSB{k}", "adapter") for k in range(3)),

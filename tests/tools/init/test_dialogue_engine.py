@@ -175,7 +175,7 @@ def test_a_dialogue_interrupted_at_any_question_resumes_to_the_same_rig(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, data: st.DataObject, found: Found
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(_engine, "rig_faults", lambda *_: set())  # the tests above check it
+        patch.setattr(_engine, "rig_faults", lambda *_: set())  # other tests check `rig_faults`
         whole = random_answers(data, found)
         text = rig_text(rig_table(whole, found))
         state = tmp_path / "rig.answers.toml"

@@ -1,4 +1,4 @@
-"""`jointfit init`: from the lines of a terminal or a script to a checked rig.toml."""
+"""`jointfit init` writes a valid rig.toml from the input of a terminal, a script or a file."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_a_typed_dialogue_writes_a_rig_that_check_accepts(tmp_path: Path, machin
         ("b", "/dev/ttyUSB1"),
     ]
     assert f"jointfitd --config {tmp_path / 'lab/rig.toml'}" in done.output
-    assert "jointfit dashboard  " in done.output  # no option for the usual broker
+    assert "jointfit dashboard  " in done.output  # the usual broker needs no option
     assert [path.name for path in (tmp_path / "lab").iterdir()] == ["rig.toml"]
     checked = CliRunner().invoke(app, ["check", str(tmp_path / "lab/rig.toml")])
     assert checked.exit_code == 0
@@ -186,7 +186,7 @@ def test_identifiers_and_names_that_are_unknown_are_filled_in_later(tmp_path: Pa
     assert json.loads(done.stdout)["open"] == OPEN
     assert f'ids = "{LATER}"' in rig.read_text()
 
-    # Every postponed answer is one fault with its remedy, and there are no others.
+    # Every postponed answer is one fault with its remedy, and there are no other faults.
     for command in (["check"], ["doctor", "--config"]):
         checked = CliRunner().invoke(app, [*command, str(rig)])
         assert checked.exit_code == 2

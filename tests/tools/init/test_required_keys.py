@@ -1,4 +1,4 @@
-"""Device families whose tables require keys without defaults: choices, and layouts."""
+"""`jointfit init` asks for required keys without default, for layouts, and for CAN identifiers."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def answer(started: Dialogue, **answers: Any) -> None:
     for key, value in answers.items():
         asked = next_question(started.answers, started.found)
         assert asked is not None
-        expected = key.rstrip("_")  # a second one of the same name
+        expected = key.rstrip("_")  # a caller appends "_" for a second answer to one question
         assert asked.question.key == expected, (asked.name, key)
         started.accept_answer(asked, value or asked.entered)
 
@@ -87,7 +87,7 @@ def test_a_key_without_default_is_asked_for_with_the_meaning_of_its_values() -> 
     with pytest.raises(AnswerError, match="an answer is needed"):
         started.accept_answer(asked, None)
     answer(started, setting="3", device="/dev/ttyUSB1", driver="", baud="")
-    assert question(started).default == "3"  # proposed for the next sensor
+    assert question(started).default == "3"  # the next sensor gets the same proposal
     imus = finished(started)["imu"]
     assert [imu["generation"] for imu in imus] == [3, 3]
 
@@ -103,7 +103,7 @@ def test_a_layout_in_a_file_becomes_part_of_the_table(tmp_path: Path) -> None:
     started = dialogue(devices=["/dev/ttyUSB0"])
     answer(started, driver="serial-table", baud=115200, device="/dev/ttyUSB1", driver_="", baud_="")
     answer(started, layout=str(file))
-    assert question(started).default == str(file)  # for the next sensor, too
+    assert question(started).default == str(file)  # the next sensor gets the same proposal
     for imu in finished(started)["imu"]:
         assert imu["frame"] == {"sync": "AA 55", "length": 16}
         assert imu["fields"]["quaternion"]["divisor"] == 32767
@@ -189,7 +189,7 @@ def rig_table_of(started: Dialogue) -> dict[str, Any]:
 
 
 class _Bus:
-    """Wire that collects the frames of simulated sensors."""
+    """CAN bus that collects the frames of simulated sensors."""
 
     bitrate = None
     is_open = True
@@ -204,7 +204,10 @@ class _Bus:
 
 @pytest.fixture
 def can0(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A bus with an XCDI sensor and two LPMS sensors: CANopen style, and sequential with floats."""
+    """Provide a bus with an XCDI sensor and two LPMS sensors.
+
+    One LPMS sensor has the mode ``canopen``, the other the mode ``sequential`` with floats.
+    """
     bus: Any = _Bus()
     sequential = LpmsCanDeviceOptions(
         mode="sequential", ids=(0x514, 0x515, 0x516, 0x517), precision="float32"

@@ -1,4 +1,4 @@
-"""Searches of `jointfit init`: the sensor that moves, identifiers on a bus, installed drivers."""
+"""`jointfit init` finds a moved sensor, the identifiers on a CAN bus, and the installed drivers."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TURNS: dict[str, float] = {}
 
 
 ASKED = asyncio.Event()
-"""Set when the user is asked to turn a sensor."""
+"""Event that is set when the dialogue asks the user to turn a sensor."""
 
 
 def ask(line: str) -> None:

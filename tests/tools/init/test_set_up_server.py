@@ -1,4 +1,4 @@
-"""The set-up page of the dashboard: its messages, and who may send them."""
+"""The set-up page of the dashboard conducts the dialogue, and refuses messages of other origins."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ async def served(path: Path) -> AsyncIterator[str]:
 
 
 def answer_all(session: SetUpSession, **values: str) -> dict[str, Any]:
-    """Answer all questions; a value is chosen by the name of its question."""
+    """Answer each question with its value in `values`; by default, with a port or the proposal."""
     state = session.handle({"do": "show"})
     while (question := state["question"]) is not None:
         key = question["name"].partition(".")[0]

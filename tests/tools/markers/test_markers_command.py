@@ -1,4 +1,4 @@
-"""`jointfit markers` as a user runs it."""
+"""`jointfit markers` refines, reports and writes marker positions, and rejects wrong options."""
 
 from __future__ import annotations
 
@@ -90,7 +90,8 @@ def test_errors_are_compared_with_the_accepted_limits(folder: Path) -> None:
     assert [line.split()[1] for line in lines] == ["training:", "validation:"]
     assert all("below 20 mm" in line for line in lines)
 
-    # one marker off by 8 cm in one frame exceeds the limit of a single error, not that of the RMS
+    # With an error of 8 cm of one marker in one frame, the maximum error exceeds its limit, but the
+    # RMS error remains below its limit.
     trial = read_trc(folder / "walk.trc")
     trial.positions[30, 1] += 0.08
     write_trc(folder / "walk.trc", trial)

@@ -216,7 +216,7 @@ class SampleRig:
         return limb | {"v": 1, "t_us": self.t_us(seconds), "frame": round(100 * seconds)}
 
     def retained(self) -> dict[str, Any]:
-        """Return the retained messages of an online rig."""
+        """Return the retained messages of a rig that is online."""
         devices = {
             f"device/{name}/availability": {
                 "v": 1, "state": "offline" if name in self.offline else "online"

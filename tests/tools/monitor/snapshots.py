@@ -1,7 +1,8 @@
 """Stored pictures of the screen, as SVG.
 
-With ``JOINTFIT_UPDATE_SNAPSHOTS=1`` the tests store the present pictures; look at them, and commit
-them with the change. pytest-textual-snapshot does the same, but needs an older pytest.
+With ``JOINTFIT_UPDATE_SNAPSHOTS=1`` the tests replace the stored pictures; check the new pictures,
+and commit them with the change. pytest-textual-snapshot has the same purpose, but needs an older
+pytest.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).resolve().parents[3]
 STORED = Path(__file__).with_name("snapshots")
 NEW = ROOT / "build" / "monitor"
-"""Folder of pictures that differ from the stored ones."""
+"""Folder of the new pictures that differ from the stored pictures."""
 UPDATE = "JOINTFIT_UPDATE_SNAPSHOTS"
 _FONT = re.compile(r"@font-face \{.*?\}\s*", re.DOTALL)
 _ID = re.compile(r"terminal-\d+")

@@ -47,7 +47,7 @@ class Screen:
     )
 
     def feed(self, data: bytes) -> None:
-        """Take bytes of the program."""
+        """Process bytes from the program."""
         self.received += len(data)
         content = self._rest + self._decoder.decode(data)
         cut = _UNFINISHED.search(content)
@@ -117,7 +117,7 @@ class TerminalProgram:
 async def terminal_program(
     command: Sequence[str], size: tuple[int, int], environment: Mapping[str, str]
 ) -> AsyncIterator[TerminalProgram]:
-    """Run a program in a pseudo-terminal of `size` columns and rows; end it with the block."""
+    """Run a program in a pseudo-terminal of `size` columns and rows during the ``with`` block."""
     ours, theirs = os.openpty()
     width, height = size
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", height, width, 0, 0))
@@ -132,7 +132,7 @@ async def terminal_program(
     def receive() -> None:
         try:
             data = os.read(ours, 65536)
-        except OSError:  # the program closed its terminal
+        except OSError:  # the program has ended, so its terminal is closed
             loop.remove_reader(ours)
             return
         program.arrivals_s.append(time.monotonic())

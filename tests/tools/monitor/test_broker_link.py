@@ -1,4 +1,4 @@
-"""The connection of the monitor, with a real broker: search, account, signed requests, losses."""
+"""`BrokerLink` finds rigs on a real broker, signs requests, and reports a lost connection."""
 
 from __future__ import annotations
 
@@ -81,7 +81,8 @@ async def test_the_only_rig_is_shown_and_a_lost_broker_is_named(broker: Broker) 
         assert str(broker.port) in state.reason
         broker.start()
         await until(lambda: state.link == "connected")
-        assert state.rig.bridge == "unknown"  # the broker lost the message
+        # The restarted broker has lost the retained message with the state of the daemon.
+        assert state.rig.bridge == "unknown"
 
 
 async def test_requests_are_signed_with_the_key_of_the_rig(broker: Broker, tmp_path: Path) -> None:

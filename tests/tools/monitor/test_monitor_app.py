@@ -1,4 +1,4 @@
-"""The Textual program: pictures of its main states, its keys, and the rate of its updates."""
+"""The screen of the Textual program equals stored pictures, and the rate of updates is limited."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ SIX = SampleRig(
 
 
 def still(state: MonitorState, at_s: float = AT_S) -> MonitorApp:
-    """Return the program without a broker, at one instant."""
+    """Return the program without a broker; its clock always shows `at_s`."""
     return MonitorApp(state, None, now=lambda: moment(at_s))
 
 

@@ -1,4 +1,4 @@
-"""The command `jointfit monitor`: its options, and what it reports before the screen opens."""
+"""`jointfit monitor` applies its options, and reports faults before the screen opens."""
 
 from __future__ import annotations
 

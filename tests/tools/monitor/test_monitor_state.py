@@ -1,4 +1,4 @@
-"""Keys, requests and answers of the monitor, without a terminal."""
+"""`MonitorState` converts keys to requests, and answers to texts, without a terminal."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_one_key_starts_the_recording_and_pressed_twice_stops_it() -> None:
     take(state, "bridge/health", SampleRig().health())
     assert state.press("R") is None
     assert state.press("j") is None
-    assert state.press("R") is None  # another key in between
+    assert state.press("R") is None  # the other key cancelled the first press of R
     assert state.press("R") == SendRequest("record", {"action": "stop"})
     answer = {"status": "ok", "data": {"directory": "/state", "file": "a.mcap", "active": False}}
     state.take_answer("record", answer, 0.0)

@@ -1,4 +1,4 @@
-"""The state of a rig: effects of messages, faulty messages, and limited memory."""
+"""`RigView` accepts any messages, even faulty messages, and needs limited memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The screen as text: every state at every size, in any script, with and without Unicode."""
+"""`screen_lines` fits every state into every terminal, and explains states and faults."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def text(state: MonitorState, width: int = 80, height: int = 24, at_s: float = 3
 
 
 def words(state: MonitorState, width: int = 80, at_s: float = 3.1) -> str:
-    """Return the screen without line breaks."""
+    """Return the text of the screen without line breaks; consecutive blanks become one blank."""
     return " ".join(text(state, width, 60, at_s).split())
 
 

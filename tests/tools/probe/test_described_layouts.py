@@ -1,4 +1,4 @@
-"""Layouts in rig.toml are tried on received data, and only where they fit."""
+"""`jointfit probe` recognizes devices by the frame layouts in a rig.toml."""
 
 from __future__ import annotations
 

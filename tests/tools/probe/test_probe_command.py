@@ -1,4 +1,4 @@
-"""`jointfit probe` opens only what is named, and its lines are a rig.toml."""
+"""`jointfit probe` opens only the named devices, and prints valid lines for a rig.toml."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ STREAMING = XbusDeviceOptions(measures_at_once=True)
 
 @asynccontextmanager
 async def hardware(folder: Path, imu: XbusDeviceOptions = STREAMING) -> AsyncIterator[NatNetServer]:
-    """A streaming IMU at `folder`/imu, and a server of motion capture."""
+    """Run an IMU that sends data at `folder`/imu, and yield a running motion-capture server."""
     device = XbusDevice(folder / "imu", options=imu)
     bodies = (RigidBodyAsset("Thigh", ("T1", "T2", "T3"), 1),)
     server = NatNetServer(NatNetServerOptions(bodies))
@@ -82,7 +82,7 @@ async def hardware(folder: Path, imu: XbusDeviceOptions = STREAMING) -> AsyncIte
 
 
 def checked(text: str) -> dict[str, Any]:
-    """Return a printed report after the check against its schema."""
+    """Return the report in `text`; require that the report matches its JSON Schema."""
     report: dict[str, Any] = orjson.loads(text)
     schema = TypeAdapter(_probe_report.ProbeReport).json_schema(mode="serialization")
     jsonschema.validate(report, schema)

@@ -1,4 +1,4 @@
-"""`jointfit replay`: time line, verification, other settings, and errors a user can correct."""
+"""`jointfit replay` prints, verifies and publishes a recording, and names errors of the user."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from tests.broker_fixture import Broker
 
 _LINK_BYTES, _LINK_PAUSE_S = 2048, 0.01
-"""Bytes that the slow link takes at once, and the pause after them, s."""
+"""Number of bytes that the slow link forwards at once, and the pause after these bytes, s."""
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +125,7 @@ def test_missing_driver_is_named(run: RecordedRun, monkeypatch: pytest.MonkeyPat
 
 @contextlib.asynccontextmanager
 async def slow_link(broker: Broker) -> AsyncIterator[str]:
-    """Run a proxy in front of the broker that takes 200 kB/s at most; yield its address."""
+    """Yield the address of a proxy that forwards at most 200 kB/s to the broker."""
 
     async def forward(
         source: asyncio.StreamReader, sink: asyncio.StreamWriter, pause_s: float
@@ -151,7 +151,7 @@ async def slow_link(broker: Broker) -> AsyncIterator[str]:
 
 @contextlib.asynccontextmanager
 async def received_poses(settings: MqttSettings) -> AsyncIterator[list[dict[str, float]]]:
-    """Subscribe to the poses of a replay; yield a list that grows."""
+    """Subscribe to the poses of a replay; yield the list of received poses, which grows."""
     poses: list[dict[str, float]] = []
     async with MqttClient(settings) as client:
         await client.subscribe("pose")
@@ -174,7 +174,7 @@ async def wait_for_poses(poses: list[dict[str, float]], number: int) -> None:
             await asyncio.sleep(0.01)
 
 
-@pytest.mark.real_time  # the broker drops messages that their reader takes too late
+@pytest.mark.real_time  # the broker drops messages if a subscriber reads too slowly
 @pytest.mark.parametrize("speed", [5.0, math.inf])
 async def test_replay_over_mqtt_has_its_own_topics_and_recorded_times_and_drops_nothing(
     run: RecordedRun, broker: Broker, speed: float
@@ -187,7 +187,7 @@ async def test_replay_over_mqtt_has_its_own_topics_and_recorded_times_and_drops_
     retained = await retained_topics(settings)
     assert summary.took_s >= summary.seconds / speed
     assert (len(poses), summary.dropped) == (summary.states, 0)
-    begin_s = (BEGIN_NS + UNIX_NS) / 1e9  # the stamps are those of the recording
+    begin_s = (BEGIN_NS + UNIX_NS) / 1e9  # the time stamps are from the recording
     assert all(-1.0 < pose["t_us"] / 1e6 - begin_s < 6.0 for pose in poses)
     assert retained == {}
 

@@ -1,4 +1,4 @@
-"""A recorded run for the tests of the command."""
+"""A recorded run for the tests of `jointfit report`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`jointfit report` as a user runs it, on a recorded run."""
+"""`jointfit report` writes the page of a recording, and leaves an older page after a failure."""
 
 from __future__ import annotations
 

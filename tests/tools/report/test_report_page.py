@@ -1,4 +1,4 @@
-"""The page of a session: content, safety, accessibility and its look in Chromium."""
+"""The page of a session states all results, runs no code, and is accessible in Chromium."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def test_session_without_cameras_has_no_reference(session: SessionData) -> None:
 def test_long_session_stays_small_and_shows_its_peak() -> None:
     t_s = np.arange(0.0, 3600.0, 0.01)
     angle = np.sin(t_s)
-    angle[200_000] = np.radians(80.0)  # one sample of an hour
+    angle[200_000] = np.radians(80.0)  # only one sample has this value
     names = ("flexion", "adduction", "rotation")
     joint = JointSeries("knee", t_s, dict.fromkeys(names, angle), {"flexion": 0.1 + 0.0 * t_s})
     text = render_report(SessionData("long", joints=(joint,)))

@@ -29,8 +29,8 @@ class BoardFrame(NamedTuple):
     time_us: int
     counts: tuple[int, int, int, int]
     end: int = 0
-    """Number of bytes that the codec received up to the end of the frame. The decoder computes
-    from it when the first byte of the frame arrived."""
+    """Number of bytes that the codec received up to the end of the frame. The decoder
+    computes the arrival time of the first byte of the frame from this number."""
     size: int = SIZE
     """Number of bytes on the wire."""
 

@@ -37,7 +37,7 @@ class BoardDecoder(SerialDecoder[BoardFrame]):
     def convert(self, message: BoardFrame, arrival_ns: int) -> list[Decoded]:
         """Return the sample of one frame after checks of its norm, time and counter."""
         w, x, y, z = (count / SCALE for count in message.counts)
-        q = (w, x, y, z)  # sensor to east-north-up, scalar first, is canonical
+        q = (w, x, y, z)  # already canonical: sensor to ENU, scalar first
         sample = ImuSample(
             arrival_ns=arrival_ns,
             q_world_sensor=q,

@@ -9,7 +9,7 @@ from jointfit_bridge.messages import joint_state, tf_message
 
 
 def message_kinds() -> SimpleNamespace:
-    """Import the message classes of ROS."""
+    """Import and return the message classes of ROS."""
     from builtin_interfaces.msg import Time
     from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
     from sensor_msgs.msg import JointState
