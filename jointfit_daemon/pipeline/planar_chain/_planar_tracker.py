@@ -12,8 +12,9 @@ Invariant: the result depends neither on an IMU nor on a calibration.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
-from math import exp, inf
+from math import exp, inf, isfinite, nan
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,12 +32,13 @@ from jointfit_daemon.limb_model import MAX_FIT_RMS_M, body_parts, vector
 from jointfit_daemon.model import PlanarJoint, Stick, StickFigure
 from jointfit_daemon.pipeline.events import Notice, NoticeKind
 from jointfit_daemon.pipeline.planar_chain._movement_plane import PlaneEstimator
+from jointfit_daemon.pipeline.planar_chain._planar_marker_monitor import PlanarMarkerMonitor
 from jointfit_daemon.pipeline.planar_chain._planar_segment import (
     LEAST_MARKERS,
     MissingPose,
-    PlanarPose,
     PlanarSegment,
 )
+from jointfit_daemon.pipeline.planar_chain._reversal_detector import AdjacentMarker, PlanarPose
 from jointfit_daemon.timing.alignment import RateDivider
 
 if TYPE_CHECKING:
@@ -71,6 +73,14 @@ class _Side:
     circles: list[RunningCircle]
     """One circle fit for each marker of the other body part."""
     estimate: CenterEstimate | None = None
+    radii: list[float] = field(default_factory=list)
+    """Distance of each marker from its center, m; NaN if the center of the marker is refused."""
+
+    def clear(self) -> None:
+        """Discard all frames and the estimate."""
+        self.estimate, self.radii = None, []
+        for circle in self.circles:
+            circle.clear()
 
     def feed(self, pose: PlanarPose | None, child: NDArray[np.complex128]) -> None:
         """Process one frame; `child` contains the markers of the other part in the plane, m."""
@@ -84,6 +94,7 @@ class _Side:
     def fit(self) -> None:
         """Estimate the center from all frames so far."""
         each = [circle.estimate() for circle in self.circles]
+        self.radii = [float(e.radii[0]) if e.refused is None else nan for e in each]
         found = each[0] if len(each) == 1 else fuse_centers(each)
         if found.refused is None and MAX_FIT_RMS_M < found.residual < inf:
             reason = (
@@ -129,6 +140,7 @@ class PlanarTracker:
             if a is not None and b is not None and {a, b} <= self._parts.keys()
         ]
         self._names = [name for part in self._parts.values() for name in part.markers]
+        self._markers = PlanarMarkerMonitor(self._names)
         self._estimator = PlaneEstimator(len(self._names), self._forgetting)
         self._plane = self._estimator.estimate()
         self._basis: Array | None = None
@@ -166,16 +178,11 @@ class PlanarTracker:
         if fitted:
             notices = self._update_plane(t_ns)
 
-        # Estimate the pose of every part with two markers, or find the reason why it has no pose.
-        poses: dict[str, PlanarPose | MissingPose] = {}
-        if self._basis is not None:
-            poses = {
-                name: part.pose(t_ns, self._in_plane(measured[name]))
-                for name, part in self._parts.items()
-                if len(part.markers) >= LEAST_MARKERS
-            }
-            if learned:
-                self._learn(measured, poses, fit=fitted)
+        poses = {} if self._basis is None else self._poses(t_ns, measured)
+        if learned and poses:
+            self._learn(measured, poses, fit=fitted)
+        planar = poses if self._plane.normal is not None else {}
+        notices += self._markers.update(t_ns, np.isfinite(found).all(axis=1), planar)
         return [*notices, self._figure(t_ns, frame, measured, poses)] if shown else notices
 
     def _update_plane(self, t_ns: int) -> list[Output]:
@@ -207,6 +214,37 @@ class PlanarTracker:
             return np.full(len(points), complex(np.nan, np.nan))
         flat = points @ basis
         return np.asarray(flat[:, 0] + 1j * flat[:, 1])
+
+    def _poses(
+        self, t_ns: int, measured: Mapping[str, Array]
+    ) -> dict[str, PlanarPose | MissingPose]:
+        """Return the pose of every part with two markers, or the reason why it has no pose."""
+        flat = {name: self._in_plane(points) for name, points in measured.items()}
+        poses = {
+            name: part.pose(t_ns, flat[name], partial(self._adjacent, name, flat))
+            for name, part in self._parts.items()
+            if len(part.markers) >= LEAST_MARKERS
+        }
+        for name, pose in poses.items():
+            if isinstance(pose, MissingPose) and pose.renewed:
+                for joint in self._joints:
+                    for side in joint.sides if name in joint.parts else ():
+                        side.clear()
+        return poses
+
+    def _adjacent(
+        self, part: str, flat: Mapping[str, NDArray[np.complex128]]
+    ) -> list[AdjacentMarker]:
+        """Return the markers on adjacent parts that have an accepted joint center in `part`."""
+        return [
+            AdjacentMarker(complex(*side.estimate.center), radii, complex(z))
+            for joint in self._joints
+            for side in joint.sides
+            if side.parent == part
+            if side.estimate is not None and side.estimate.refused is None
+            if (radii := tuple(filter(isfinite, side.radii)))
+            for z in flat[side.child]
+        ]
 
     def _learn(
         self,
