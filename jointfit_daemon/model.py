@@ -424,11 +424,14 @@ class RunningCenter(NamedTuple):
     center: Vector | None = None
     """Position of the center, m."""
     covariance: tuple[Vector, Vector, Vector] | None = None
-    """Covariance of the center, m²; 0 along unobserved directions."""
+    """Covariance of the center, m², which is 0 along `unseen`. If the residuals persist, all frames
+    together count as one observation of the soft-tissue artefact."""
     unseen: tuple[Vector, ...] = ()
-    """Unit directions along which the center was not observed."""
+    """Unit directions along which the center was not observed. Their largest component is positive.
+    """
     axis: Vector | None = None
-    """Unit axis of the joint if it is a hinge; None otherwise."""
+    """Unit axis of the joint if it is a hinge: the unobserved direction if there is exactly one;
+    None otherwise."""
     effective_frames: float | None = None
     """Number of independent frames."""
     position: Vector | None = None

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jointfit_daemon.calibration.anatomy import posture_covariance
 from jointfit_daemon.calibration.guidance import LiveJointCenters
 from jointfit_daemon.center_of_rotation.spatial import SphereLimits
 from jointfit_daemon.kinematics import rotation
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration.guidance import LiveJointCenter
     from jointfit_daemon.center_of_rotation import CenterEstimate
     from jointfit_daemon.limb_model import CalibratedCenter, Calibration
-    from jointfit_daemon.model import Chain, MocapFrame
+    from jointfit_daemon.model import Chain, MocapFrame, Vector
 
 RATE_HZ = 20.0
 """Number of camera frames used per second. Joints rotate by a few degrees between two of these
@@ -52,8 +53,9 @@ class MovingCenters:
     .. math:: D^2 = \delta^T (C + C_{calibrated})^{-1} \delta \sim \chi^2_r,
 
     over the r directions that both movements observed. Residuals from soft-tissue artefact repeat
-    with posture. In both covariances, all frames together count as one observation of these
-    residuals.
+    with posture. In the calibrated and in the published covariance, all frames together count as
+    one observation of these residuals. The artefact displaces both centers alike, so the test
+    counts it once: its C is the random error of the running center.
 
     Parameters
     ----------
@@ -157,12 +159,12 @@ class MovingCenters:
         item = self._calibration.segment.get(segment)
         turn = np.eye(3) if item is None else rotation.to_matrix(np.array(item.q_static)).T
 
-        a, b, c = turn @ fit.covariance @ turn.T
+        a, b, c = turn @ posture_covariance(fit) @ turn.T
         found = found._replace(
             center=vector(turn @ (fit.center - parts.origins[parts.names.index(segment)])),
             covariance=(vector(a), vector(b), vector(c)),
-            unseen=tuple(vector(turn @ direction) for direction in fit.unseen),
-            axis=None if fit.axis is None else vector(turn @ fit.axis),
+            unseen=tuple(_signed(turn @ direction) for direction in fit.unseen),
+            axis=None if fit.axis is None else _signed(turn @ fit.axis),
             effective_frames=fit.effective_frames,
         )
         reference = self._calibration.joint[live.joint].rotation
@@ -172,6 +174,11 @@ class MovingCenters:
         if shift is None:
             return found
         return found._replace(shift=vector(turn @ shift), p_value=chance, moved=chance < MOVED_P)
+
+
+def _signed(direction: Array) -> Vector:
+    """Return a direction with the sign for which its largest component is positive."""
+    return vector(direction * np.sign(direction[np.argmax(np.abs(direction))]))
 
 
 def _shift_test(fit: CenterEstimate, reference: CalibratedCenter) -> tuple[Array | None, float]:

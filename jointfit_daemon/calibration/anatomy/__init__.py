@@ -1,6 +1,7 @@
 """Marker clusters, joint centers and segment frames."""
 
 from jointfit_daemon.calibration.anatomy._chosen_center import CenterChoice
+from jointfit_daemon.calibration.anatomy._foreign_markers import ForeignMarker, foreign_markers
 from jointfit_daemon.calibration.anatomy._joint_center import (
     MIN_DIRECTION_RAD,
 )
@@ -24,6 +25,7 @@ from jointfit_daemon.calibration.anatomy._segment_frames import (
     find_anatomy,
     on_skin,
     place_unobserved,
+    posture_covariance,
 )
 from jointfit_daemon.calibration.anatomy._standing_prior import apply_standing_prior
 
@@ -34,6 +36,7 @@ __all__ = [
     "Anatomy",
     "CenterChoice",
     "ClusterTrack",
+    "ForeignMarker",
     "JointCenter",
     "apply_standing_prior",
     "artefact_covariance",
@@ -41,10 +44,12 @@ __all__ = [
     "columns",
     "exchanged_labels",
     "find_anatomy",
+    "foreign_markers",
     "marked_parts",
     "moving_template",
     "on_skin",
     "place_unobserved",
+    "posture_covariance",
     "static_cluster",
     "track_cluster",
     "track_clusters",

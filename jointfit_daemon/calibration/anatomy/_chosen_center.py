@@ -102,7 +102,13 @@ def chosen_center(
     interval = step * float(np.median(np.diff(parent.t_ns))) / 1e9
     residuals = None if child.residuals is None else child.residuals[::step]
     movement = Movement(
-        points, above, below, residuals=residuals, near=np.zeros(3), interval=interval
+        points,
+        above,
+        below,
+        residuals=residuals,
+        near=np.zeros(3),
+        interval=interval,
+        names=child.markers,
     )
     if METHODS[method].planar:
         hinge = estimate_center(movement, "sara")

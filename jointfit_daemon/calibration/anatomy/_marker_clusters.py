@@ -67,6 +67,8 @@ class ClusterTrack:
     """Origin of the cluster in the static world, m, shape (3,)."""
     residuals: Array | None = None
     """Residuals of the cameras for the markers, m, shape (m, k); NaN where unknown."""
+    markers: tuple[str, ...] | None = None
+    """Names of the k markers; None for a rigid body."""
 
     def to_static(self, x: Array) -> Array:
         """Return current points, shape (m, ..., 3), in static-world coordinates of this part."""
@@ -90,7 +92,7 @@ def columns(track: OpticalTrack, name: str, settings: CalibrationSettings) -> li
         missing markers, each with the nearest spelling.
     """
     wanted = settings.markers[name]
-    found = _marker_columns(track, name, wanted)
+    found = marker_columns(track, name, wanted)
     if len(set(wanted)) < MIN_MARKERS:
         raise CalibrationError(
             f"markers.{name}: {len(set(wanted))} markers, at least {MIN_MARKERS} are needed"
@@ -98,7 +100,14 @@ def columns(track: OpticalTrack, name: str, settings: CalibrationSettings) -> li
     return found
 
 
-def _marker_columns(track: OpticalTrack, name: str, wanted: Sequence[str]) -> list[int]:
+def marker_columns(track: OpticalTrack, name: str, wanted: Sequence[str]) -> list[int]:
+    """Return the columns of markers of a body part.
+
+    Raises
+    ------
+    CalibrationError
+        Markers are missing in the stream.
+    """
     index = {marker: i for i, marker in enumerate(track.markers)}
     missing = [unknown_name("marker", m, track.markers, wanted) for m in wanted if m not in index]
     if missing:
@@ -187,7 +196,7 @@ def track_cluster(track: OpticalTrack, cluster: MarkerCluster) -> ClusterTrack:
         points = rotation.rotate(q[:, None], cluster.template) + p[:, None]
         return ClusterTrack(track.t_ns, q, p, points, np.zeros(len(q)), cluster.origin)
 
-    chosen = _marker_columns(track, cluster.name, cluster.markers)
+    chosen = marker_columns(track, cluster.name, cluster.markers)
     points = track.positions[:, chosen]
     residuals = None if track.residuals is None else track.residuals[:, chosen]
     q, p, rms = steady_fit(cluster.template, points)
@@ -196,7 +205,7 @@ def track_cluster(track: OpticalTrack, cluster: MarkerCluster) -> ClusterTrack:
     wrong = rms > MAX_FIT_RMS_M
     q[wrong], p[wrong] = np.nan, np.nan
     points = np.where(wrong[:, None, None], np.nan, points)
-    return ClusterTrack(track.t_ns, q, p, points, rms, cluster.origin, residuals)
+    return ClusterTrack(track.t_ns, q, p, points, rms, cluster.origin, residuals, cluster.markers)
 
 
 def track_clusters(
@@ -220,7 +229,7 @@ def exchanged_labels(
     order = [
         column
         for cluster in search.clusters
-        for column in _marker_columns(track, cluster.name, cluster.markers)
+        for column in marker_columns(track, cluster.name, cluster.markers)
     ]
     faults = explain_trial(search, track.positions[:, order])
     return [fault for fault in faults if len(fault.markers) > 1]

@@ -325,6 +325,21 @@ def artefact_covariance(fit: CenterEstimate) -> Array:
     return fit.covariance + RADIAL_ARTEFACT_SD_M**2 * fit.leverage
 
 
+def posture_covariance(fit: CenterEstimate) -> Array:
+    r"""Return the covariance of a center with its persistent residuals counted once, m², (3, 3).
+
+    .. math:: C + s^2 L
+
+    where C is ``fit.covariance``, s = ``fit.noise`` and L = ``fit.leverage``. Residuals from
+    soft-tissue artefact persist from frame to frame and repeat with posture. All frames together
+    then count as one observation of these residuals. Without persistent residuals, the result is C.
+    It is 0 along unobserved directions.
+    """
+    if fit.leverage is None or "residuals_persist" not in fit.flags:
+        return fit.covariance
+    return fit.covariance + fit.noise**2 * fit.leverage
+
+
 def _with_lengths(
     chain: Chain, fits: dict[str, JointCenter | None]
 ) -> dict[str, JointCenter | None]:

@@ -241,7 +241,10 @@ class LiveJointCenters:
             _finite(fit.arc), _finite(fit.conditioning), frames, unseen, fit.refused,
         )  # fmt: skip
         observed = basis @ own @ basis.T
-        return one, replace(fit, center=center, covariance=observed, unseen=rest, leverage=lever)
+        axis = rest[0] if len(rest) == 1 else None
+        return one, replace(
+            fit, center=center, covariance=observed, unseen=rest, axis=axis, leverage=lever
+        )
 
 
 def _finite(value: float) -> float:

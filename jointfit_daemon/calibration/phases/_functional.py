@@ -23,6 +23,7 @@ from jointfit_daemon.calibration.anatomy import (
     ClusterTrack,
     exchanged_labels,
     find_anatomy,
+    foreign_markers,
     track_clusters,
 )
 from jointfit_daemon.calibration.phases._cluster_refinement import RefinedClusters, refine_clusters
@@ -80,9 +81,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.calibration._trial import CalibrationSettings, CalibrationTrial
+    from jointfit_daemon.calibration._trial import (
+        CalibrationSettings,
+        CalibrationTrial,
+        OpticalTrack,
+    )
     from jointfit_daemon.calibration.phases._plate_alignment import PlateAlignment
-    from jointfit_daemon.limb_model import SegmentModel
+    from jointfit_daemon.limb_model import MarkerCluster, SegmentModel
     from jointfit_daemon.model import Chain, Quaternion
     from jointfit_daemon.timing.lag import LagEstimate
 
@@ -199,9 +204,8 @@ def _tracks(
     ]
 
     tracks = track_clusters(functional.optical, pose.clusters)
-    exchanges = exchanged_labels(functional.optical, pose.clusters)
-    reasons += [f"{one.text}; correct the labels and repeat the phase" for one in exchanges]
-    explained = {part for one in exchanges for part in one.parts}
+    faults, explained = _label_faults(functional.optical, pose.clusters)
+    reasons += faults
     for segment in chain.segments:
         if segment in explained:
             continue
@@ -229,6 +233,24 @@ def _tracks(
     if reasons:
         raise CalibrationError(*reasons)
     return tracks
+
+
+def _label_faults(
+    track: OpticalTrack, clusters: Mapping[str, MarkerCluster]
+) -> tuple[list[str], set[str]]:
+    """Return the reasons to refuse a movement because of its labels, and their body parts."""
+    # Labels that were exchanged since the static pose also move with another part. If another
+    # marker of the part moves, its cluster is wrong, and so are exchanges that are found with it.
+    foreign = foreign_markers(track, clusters)
+    exchanges = [
+        exchange
+        for exchange in exchanged_labels(track, clusters)
+        if all(one.marker in exchange.markers for one in foreign if one.part in exchange.parts)
+    ]
+    explained = {part for exchange in exchanges for part in exchange.parts}
+    foreign = [one for one in foreign if one.part not in explained]
+    reasons = [f"{one.text}; correct the labels and repeat the phase" for one in exchanges]
+    return reasons + [one.text for one in foreign], explained | {one.part for one in foreign}
 
 
 def refined_tracks(

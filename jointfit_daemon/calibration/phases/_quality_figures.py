@@ -19,7 +19,7 @@ from jointfit_daemon.calibration._quality import (
     LagQuality,
     MeasuredLag,
 )
-from jointfit_daemon.calibration.anatomy import SKIN_SD_M, artefact_covariance
+from jointfit_daemon.calibration.anatomy import SKIN_SD_M, artefact_covariance, posture_covariance
 from jointfit_daemon.calibration.registration import NO_LAG
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.limb_model import (
@@ -75,11 +75,8 @@ def joint_record(found: JointCenter | None) -> JointCalibration:
     if fit is None:
         return JointCalibration(center, sd, found.source, None, found.gap_rms)
 
-    covariance = fit.covariance
-    if fit.leverage is not None and "residuals_persist" in fit.flags:
-        covariance = covariance + fit.noise**2 * fit.leverage
     unseen = tuple(vector(direction) for direction in fit.unseen)
-    reference = CalibratedCenter(vector(fit.center), _rows(covariance), unseen)
+    reference = CalibratedCenter(vector(fit.center), _rows(posture_covariance(fit)), unseen)
     return JointCalibration(center, sd, found.source, fit.residual, found.gap_rms, reference)
 
 
