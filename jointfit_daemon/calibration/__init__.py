@@ -10,7 +10,11 @@ from jointfit_daemon.calibration._jobs import (
     RefitJob,
     StaticJob,
 )
-from jointfit_daemon.calibration._refinement_choices import RefinementCost, RefinementMethod
+from jointfit_daemon.calibration._refinement_choices import (
+    METHODS_OF_OPTION,
+    RefinementCost,
+    RefinementMethod,
+)
 from jointfit_daemon.calibration._trial import (
     PLATE,
     CalibrationSettings,
@@ -23,6 +27,7 @@ from jointfit_daemon.calibration._trial import (
 )
 
 __all__ = [
+    "METHODS_OF_OPTION",
     "PLATE",
     "AlignJob",
     "CalibrationError",

@@ -14,7 +14,7 @@ import numpy as np
 from jointfit_daemon.center_of_rotation import _planar_methods
 from jointfit_daemon.center_of_rotation._movement import Movement
 from jointfit_daemon.center_of_rotation._planar_methods import each
-from jointfit_daemon.center_of_rotation._result import refusal
+from jointfit_daemon.center_of_rotation._result import name_flagged_markers, refusal
 from jointfit_daemon.center_of_rotation.spatial import (
     NOISE_FACTOR,
     RunningSphere,
@@ -111,7 +111,8 @@ def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterE
         return refusal(chosen.name, points.shape[-1], 0, reason)
 
     given = [getattr(movement, name) for name in chosen.needs]
-    return _beyond_parent(chosen.run(movement, *given), movement.parent_markers)
+    found = _beyond_parent(chosen.run(movement, *given), movement.parent_markers)
+    return found if movement.names is None else name_flagged_markers(found, movement.names)
 
 
 def _automatic(movement: Movement) -> str:

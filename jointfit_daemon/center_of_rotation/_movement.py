@@ -79,6 +79,8 @@ class Movement:
     """
     interval: float = 0.01
     """Time between frames, s."""
+    names: tuple[str, ...] | None = None
+    """Names of the k markers of `points`, for the flags of the estimate; None if unknown."""
 
     def both_markers(self) -> tuple[Array, Array] | None:
         """Return the markers of parent and child, each in coordinates of its body, m.

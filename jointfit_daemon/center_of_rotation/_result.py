@@ -6,13 +6,15 @@ contains the reason. No field of a usable estimate is NaN.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from jointfit_daemon.arrays import Array
 
 
@@ -65,7 +67,9 @@ class CenterEstimate:
     None if not computed. The artefact repeats with posture, so more frames do not reduce this
     covariance."""
     flags: tuple[str, ...] = ()
-    """Findings about the data, e.g. ``orientation_inconsistent``."""
+    """Findings about the data, e.g. ``orientation_inconsistent``. A flag about a marker, such as
+    ``marker_off:2``, has the index of the marker; `name_flagged_markers` replaces it by the name.
+    """
     within95: float | None = None
     """Squared Mahalanobis distance eᵀC⁻¹e that 95 % of the errors e of this method do not exceed; C
     is the covariance. If None, use the quantile of the chi-square distribution.
@@ -98,3 +102,15 @@ def refusal(method: str, d: int, frames: int, reason: str) -> CenterEstimate:
         unseen=np.eye(d),
         refused=reason,
     )
+
+
+def name_flagged_markers(estimate: CenterEstimate, names: Sequence[str]) -> CenterEstimate:
+    """Replace the index of a marker in each flag by the marker's name.
+
+    `names` contains the names in the order of the indices.
+    """
+    flags = []
+    for flag in estimate.flags:
+        kind, separator, index = flag.partition(":")
+        flags.append(f"{kind}:{names[int(index)]}" if separator else flag)
+    return replace(estimate, flags=tuple(flags))

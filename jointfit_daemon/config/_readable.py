@@ -42,7 +42,7 @@ def readable_part(table: Mapping[str, Any], model: type[Model], wrong: _Location
     fields = model.model_fields
     unknown = table.keys() - fields.keys()
     misspelled = {nearest_key(name, fields) for name in unknown} - table.keys()
-    values = {}
+    values: dict[str, Any] = {}
     for name, field in fields.items():
         if name in table:
             inside = [place[1:] for place in wrong if place[:1] == (name,)]
@@ -53,7 +53,7 @@ def readable_part(table: Mapping[str, Any], model: type[Model], wrong: _Location
             values[name] = field.get_default(call_default_factory=True)
     if model.model_config.get("extra") == "allow":
         values |= {name: value for name, value in table.items() if name not in values}
-    return model.model_construct(**values)
+    return model.model_construct(values.keys() & table.keys(), **values)
 
 
 def _readable(value: Any, annotation: Any, wrong: _Locations) -> Any:

@@ -141,12 +141,13 @@ class _Repair:
 
     def parse(self) -> dict[str, Any] | None:
         """Remove repeated keys and tables; return the table, or None if the text stays invalid."""
-        for _ in range(_MOST_REPEATED):
-            error = _error_of(text := "\n".join(self.lines))
-            if error is None:
-                return self._merge_tables(parse_toml(text))
+        removed = 0
+        while (error := _error_of(text := "\n".join(self.lines))) is not None:
+            if removed == _MOST_REPEATED:
+                return None
             self._remove_repeated(*error)
-        return None
+            removed += 1
+        return self._merge_tables(parse_toml(text))
 
     def _report(self, at: int, text: str) -> None:
         line = self._original[at].strip()

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import ipaddress
 import math
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from pydantic import Field, ValidationInfo, field_validator
 from typing_extensions import override  # typing contains it from Python 3.12
 
-from jointfit_daemon.calibration import (  # noqa: TC001 - pydantic reads them
+from jointfit_daemon.calibration import (
+    METHODS_OF_OPTION,
     CenterMethod,
     RefinementCost,
     RefinementMethod,
@@ -124,7 +125,10 @@ class ChainRefinementTable(Settings):
         "joint", description="`joint`: poses and markers in one solve; `block`, or `search` (slow)"
     )
     prior: float = Field(
-        0.05, ge=0, le=100, description="cost of a displacement relative to a tracking error"
+        0.05,
+        ge=0,
+        le=100,
+        description="cost of a displacement relative to a tracking error; not with method `search`",
     )
     cost: RefinementCost = Field(
         "l2", description="`l2`: squared errors; `l1`: distances (not with method `search`)"
@@ -144,7 +148,8 @@ class ChainRefinementTable(Settings):
         0.0,
         ge=0,
         le=0.5,
-        description="share of the training part, at its end, that decides when the iteration stops",
+        description="share of the training part, at its end, that decides when the iteration "
+        "stops; not with method `search`",
     )
     frames: int = Field(
         150, ge=10, le=1000, description="largest number of frames of each part, evenly spaced"
@@ -158,9 +163,21 @@ class ChainRefinementTable(Settings):
     @override
     def contradictions(self) -> Iterator[tuple[str, str]]:
         """Yield options that exclude each other."""
+        for key in sorted(self.model_fields_set):
+            methods = METHODS_OF_OPTION.get(key.removesuffix("_mm"), get_args(RefinementMethod))
+            # A method that is not in the list of methods is a fault of the key `method`.
+            if self.method in get_args(RefinementMethod) and self.method not in methods:
+                yield (
+                    key,
+                    (
+                        f"method {self.method} does not use this key: remove it, or use method "
+                        f"{' or '.join(methods)}"
+                    ),
+                )
         first_mm: float | None = self.first_step_mm  # None: key cannot be read
         last_mm: float | None = self.threshold_mm
-        if first_mm is not None and last_mm is not None and last_mm > first_mm:
+        exceeds = first_mm is not None and last_mm is not None and last_mm > first_mm
+        if exceeds and self.method == "search":
             yield "threshold_mm", f"expected first_step_mm = {first_mm:g} or less"
         if self.cost == "l1" and self.method == "search":
             yield "cost", "method search has no loss function: use joint or block, or l2"

@@ -64,6 +64,12 @@ def join_lines(text: str) -> str:
     )  # fmt: skip
 
 
+def is_given(context: typer.Context, parameter: str) -> bool:
+    """Return whether a parameter is on the command line, and not only a default value."""
+    source = context.get_parameter_source(parameter)
+    return source is not None and source.name == "COMMANDLINE"
+
+
 class CommandGroup(TyperGroup):
     """Runs a command and converts errors that a user can correct into a message."""
 

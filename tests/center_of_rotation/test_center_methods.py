@@ -220,3 +220,17 @@ def test_three_frames_predict_their_error_from_the_residuals_of_the_cameras() ->
     actual = np.mean(np.sum(np.square(errors), axis=1))
     assert np.sqrt(np.mean(stated) / actual) == pytest.approx(1.0, abs=0.1)
     assert np.sqrt(np.mean(unstated) / actual) > 1.5
+
+
+def test_a_noisy_marker_is_flagged_by_its_name_if_another_marker_is_missing() -> None:
+    rng = np.random.default_rng(7)
+    points = carried(ball_turns(rng, 45.0, 300))
+    points = points + rng.normal(0.0, 1e-3, points.shape)
+    points[:, 0] = np.nan
+    points[:, 2] += rng.normal(0.0, 0.02, (300, 3))
+    unnamed, named = (
+        estimate_center(Movement(points, names=names), "running_sphere")
+        for names in (None, ("C1", "C2", "C3", "C4"))
+    )
+    assert "noisy_marker:2" in unnamed.flags
+    assert "noisy_marker:C3" in named.flags

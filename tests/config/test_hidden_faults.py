@@ -322,6 +322,16 @@ def test_no_syntax_error_hides_a_fault_or_shows_internals(
     assert "('" not in shown
 
 
+@pytest.mark.parametrize("repeated", [19, 20])
+def test_as_many_repeated_keys_as_are_reported_hide_no_other_fault(
+    tmp_path: Path, repeated: int
+) -> None:
+    line = 'name = "bench"\n'
+    shown = check(tmp_path, SEVERAL.replace(line, line * (repeated + 1), 1)).stderr
+    assert shown.count("name occurs a second time") == repeated
+    assert "imu[S4].ids.quaternion" in shown
+
+
 @pytest.mark.parametrize(
     ("keys", "line"),
     [

@@ -175,21 +175,30 @@ def test_markers_that_the_model_lacks_are_a_remark(rig: Table) -> None:
 def test_options_of_the_refinement_are_those_of_the_command(rig: Table) -> None:
     rig["calibration"] = {
         "chain_refinement": {
-            "method": "search", "prior": 0.1, "weights": {"T1": 0.5}, "lock": ["C1", "C2.x"],
-            "holdout": 0.2, "frames": 80, "first_step_mm": 5, "threshold_mm": 1, "limit_s": 30,
+            "method": "block", "prior": 0.1, "weights": {"T1": 0.5}, "lock": ["C1", "C2.x"],
+            "holdout": 0.2, "frames": 80, "limit_s": 30,
         }
     }  # fmt: skip
     refinement = parse_rig(rig).calibration.chain_refinement
     assert refinement is not None
     settings = refinement.settings
-    assert (settings.method, settings.prior, settings.frames) == ("search", 0.1, 80)
-    assert (settings.search.first_step_m, settings.search.threshold_m) == (0.005, 0.001)
+    assert (settings.method, settings.prior, settings.frames) == ("block", 0.1, 80)
     assert settings.holdout_share == 0.2
     assert refinement.limit_s == 30.0
     of = {m.name: m for m in refinement.model.markers}
     assert of["T1"].weight == 0.5
     assert of["C1"].locked == (True, True, True)
     assert of["C2"].locked == (True, False, False)
+
+
+def test_steps_of_the_search_are_options(rig: Table) -> None:
+    options = {"method": "search", "first_step_mm": 5, "threshold_mm": 1}
+    rig["calibration"] = {"chain_refinement": options}
+    refinement = parse_rig(rig).calibration.chain_refinement
+    assert refinement is not None
+    assert refinement.settings.method == "search"
+    search = refinement.settings.search
+    assert (search.first_step_m, search.threshold_m) == (0.005, 0.001)
 
 
 def test_weights_of_a_file_replace_its_name(rig: Table, tmp_path: Path) -> None:
@@ -210,7 +219,18 @@ def test_weights_of_a_file_replace_its_name(rig: Table, tmp_path: Path) -> None:
         ({"weights": {"T9": 1.0}}, "marker T9: unknown marker; did you mean"),
         ({"weights": {"T1": -1.0}}, "weight of T1: expected a number of 0 or more"),
         ({"weights": "nowhere.toml"}, "nowhere.toml: no such file: check the path"),
-        ({"threshold_mm": 9.0}, "threshold_mm = 9.0: expected first_step_mm = 8 or less"),
+        (
+            {"method": "search", "threshold_mm": 9.0},
+            "threshold_mm = 9.0: expected first_step_mm = 8 or less",
+        ),
+        (
+            {"method": "search", "prior": 0.05},
+            "chain_refinement.prior = 0.05: method search does not use this key: remove it, or use"
+            " method joint or block",
+        ),
+        ({"method": "search", "holdout": 0.2}, "holdout = 0.2: method search does not use this"),
+        ({"first_step_mm": 8.0}, "first_step_mm = 8.0: method joint does not use this key: remove"),
+        ({"method": "block", "threshold_mm": 2.0}, "threshold_mm = 2.0: method block does not use"),
         ({"method": "search", "cost": "l1"}, "method search has no loss function"),
         ({"method": "serach"}, "did you mean 'search'?"),
         ({"frames": 5}, "chain_refinement.frames = 5: should be greater than or equal to 10"),
@@ -236,6 +256,13 @@ def test_another_fault_of_the_calibration_hides_none_of_its_refinement(
     assert "marker T9: unknown marker" in found
     assert "marker C9: unknown marker" in found
     assert ("static_s = 500" if "static_s" in other else "frames = 5") in found
+
+
+def test_another_fault_adds_no_key_that_the_method_does_not_use(rig: Table) -> None:
+    """The default values of absent keys are no contradictions to the method."""
+    rig["calibration"] = {"static_s": 500, "chain_refinement": {"method": "search"}}
+    (text,) = refusals(rig)
+    assert "static_s = 500" in text
 
 
 def test_refinement_without_a_chain_model_is_refused(rig: Table) -> None:

@@ -19,7 +19,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.calibration.record import CalibrationStore
 from jointfit_daemon.config import load_rig
@@ -31,6 +31,9 @@ from tests.endurance.slopes import ERROR, RESULTS, faults_of, slope_of, table_of
 from tests.faults.run import PAGE, render, stored
 from tests.limb_model.plain_calibration import plain_calibration
 from tests.system.station import OUTCOMES, Listener, broker
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 FOLDER = Path(__file__).parent
 ROOT = FOLDER.parents[1]
@@ -104,11 +107,14 @@ def daemon_values(listener: Listener, movement: Movement, unix_ns: int) -> dict[
     return {
         ERROR: errors[len(errors) // 2] if errors else math.nan,
         "age of samples, ms": max(device["delay_us"]["p50"] for device in devices) / 1000,
-        "skew of the clocks, ppm": max(
-            (math.nan if device["skew_ppm"] is None else device["skew_ppm"] for device in devices),
-            key=abs,
-        ),
+        "skew of the clocks, ppm": largest_skew_ppm([device["skew_ppm"] for device in devices]),
     }
+
+
+def largest_skew_ppm(skews: Sequence[float | None]) -> float:
+    """Return the skew with the largest absolute value, ppm; NaN if a skew is unknown."""
+    known = [skew for skew in skews if skew is not None]
+    return max(known, key=abs) if len(known) == len(skews) else math.nan
 
 
 def daemon_process(folder: Path, movement: Movement, *, compiled: bool) -> ChildProcess:

@@ -10,6 +10,7 @@ Invariant: of twenty runs without growth, about one has a slope in any of its qu
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -115,6 +116,11 @@ def faults_of(results: dict[str, Any]) -> list[str]:
         " per million samples"
         for name, slope in results["slopes"].items()
         if abs(slope["per_million"]) > slope["half_width"]
+    ]
+    faults += [
+        f"{name}: some values are unknown"
+        for name, slope in results["slopes"].items()
+        if math.isnan(slope["per_million"])
     ]
     if results["worst_error_deg"] > MOST_ERROR_DEG:
         faults.append(f"{ERROR}: {results['worst_error_deg']}, limit {MOST_ERROR_DEG:g}")

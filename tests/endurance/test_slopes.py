@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from math import isnan, nan
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
+from tests.endurance.__main__ import largest_skew_ppm
 from tests.endurance.slopes import ERROR, faults_of, outcomes_of, slope_of, warning_of
 
 if TYPE_CHECKING:
@@ -86,6 +88,7 @@ def test_a_run_without_growth_has_no_fault() -> None:
     ("changed", "part"),
     [
         ({"slopes": {"threads": {"per_million": 0.3, "half_width": 0.2}}}, "threads has a slope"),
+        ({"slopes": {"skew": {"per_million": nan, "half_width": nan}}}, "skew: some values are un"),
         ({"worst_error_deg": 3.1}, f"{ERROR}: 3.1, limit 3"),
         ({"counters": results()["counters"] | {"unaccounted": 1}}, "1 samples have no outcome"),
         ({"counters": results()["counters"] | {"lost": 7}}, "smaller --factor than 12"),
@@ -96,6 +99,12 @@ def test_growth_wrong_poses_and_missing_samples_are_faults(
 ) -> None:
     (fault,) = faults_of(results(**changed))
     assert part in fault
+
+
+def test_an_unknown_skew_of_any_sensor_is_not_replaced_by_that_of_another_sensor() -> None:
+    assert largest_skew_ppm([1.0, -3.0, 2.0]) == -3.0
+    assert isnan(largest_skew_ppm([None, 1.0]))
+    assert isnan(largest_skew_ppm([1.0, None, -3.0]))
 
 
 def test_a_run_below_ten_million_samples_is_too_short_to_judge_growth() -> None:

@@ -265,6 +265,8 @@ OPTIONS: list[tuple[tuple[str, ...], str]] = [
     (("decode", "xbus", "xbus.bin", "--set", f"{'a.' * 9000}b=1"), "nested more than 32"),
     (("decode", "xbus", "xbus.bin", "--set", f"baud={2**64}"), "more than 64 bits"),
     (("calibrate", "rig.toml", "--abort", "--phase", "static"), "--abort"),
+    (("calibrate", "rig.toml", "--recording", "trial.mcap"), "--rig rig.toml"),
+    (("calibrate", "a.toml", "--rig", "b.toml", "--recording", "trial.mcap"), "a.toml"),
     (("center-study", "--repeats", "0"), "--repeats"),
     (("center-study", "--out", "leg.toml"), "leg.toml"),
     (("sample", "leg.toml"), "leg.toml"),

@@ -65,10 +65,15 @@ def check(
     Raises
     ------
     RefinementError
-        A fault prevents the refinement; the message lists all faults.
+        A fault prevents the refinement; the message lists the faults of all trials. Trials with
+        the same name are parts of one movement and have one fault.
     """
     every = [*trials, *validation]
-    faults = [f for trial in every for f in find_trial_faults(model, trial)]
+    by_name: dict[str, list[str]] = {}
+    for trial in every:
+        if found := find_trial_faults(model, trial):
+            by_name.setdefault(trial.name, found)
+    faults = [fault for found in by_name.values() for fault in found]
     free, held = _movable(model, trials)
     if not trials:
         faults.append("no training trial given")
@@ -82,14 +87,7 @@ def check(
 
     if faults:
         raise RefinementError("; ".join(faults))
-    usable, notes = [], [*held, *_gaps(model, every)]
-    for trial in every:
-        size = _stretch(model, trial)
-        if np.isfinite(size) and not 1.0 / _NOTED_STRETCH < size < _NOTED_STRETCH:
-            notes.append(
-                f"{trial.name}: {size:.2f} times as large as the model: scale the model, otherwise"
-                " the refinement compensates for its size"
-            )
+    usable, notes = [], [*held, *_gaps(model, every), *_size_notes(model, every)]
     for trial in trials:
         cleaned, remarks, wrong = _labels(model, trial)
         usable.append(cleaned)
@@ -140,6 +138,20 @@ def _stretch(model: ChainModel, trial: MotionTrial) -> float:
             measured = np.linalg.norm(y[both, i] - y[both, j], axis=-1)
             ratios.append(float(np.median(measured)) / apart)
     return float(np.median(ratios)) if ratios else float("nan")
+
+
+def _size_notes(model: ChainModel, trials: Sequence[MotionTrial]) -> list[str]:
+    """Return a note for each name of a trial whose size differs from the size of the model."""
+    notes: dict[str, str] = {}
+    for trial in trials:
+        size = _stretch(model, trial)
+        if np.isfinite(size) and not 1.0 / _NOTED_STRETCH < size < _NOTED_STRETCH:
+            text = (
+                f"{trial.name}: {size:.2f} times as large as the model: scale the model, otherwise"
+                " the refinement compensates for its size"
+            )
+            notes.setdefault(trial.name, text)
+    return list(notes.values())
 
 
 def _movable(

@@ -240,9 +240,10 @@ def _notes(wanted: ChainRefinement, found: Refinement, figures: ChainQuality) ->
             "was evaluated. Use fewer frames, another method, or a longer limit_s"
         )
     if found.gauge.fixed_by == "nothing":
+        prior = "use method joint or block" if found.method == "search" else "set prior"
         notes.append(
             f"{name}: {found.gauge.free} motions of {', '.join(found.gauge.involved)} are not "
-            "determined by the movement: lock markers on bony landmarks, or set prior"
+            f"determined by the movement: lock markers on bony landmarks, or {prior}"
         )
     if (after := figures.after) is not None and not after.accepted:
         notes.append(

@@ -14,7 +14,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.center_of_rotation._path_statistics import arc_of
-from jointfit_daemon.center_of_rotation._result import CenterEstimate, refusal
+from jointfit_daemon.center_of_rotation._result import (
+    CenterEstimate,
+    name_flagged_markers,
+    refusal,
+)
 from jointfit_daemon.center_of_rotation.spatial._concentric_spheres import paths_of
 from jointfit_daemon.center_of_rotation.spatial._observability import (
     MIN_CONDITIONING,
@@ -100,6 +104,7 @@ def center_of(
     if seen is None:
         return refusal(method, d, sums.frames, STRAIGHT), None
     found = _answer(sums, paths, seen, near, limits)
+    found = name_flagged_markers(found, [str(j) for j in np.flatnonzero(usable)])
     radii = np.full(len(usable), np.nan)
     radii[usable] = found.radii
     whole = seen.shown.shape[0] == seen.shown.shape[1]

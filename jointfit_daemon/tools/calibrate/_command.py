@@ -24,7 +24,7 @@ from jointfit_daemon.tools.calibrate._phase_tracker import (
 )
 from jointfit_daemon.tools.calibrate._report import ProgressLines, movement_lines, report
 from jointfit_daemon.tools.calibrate._versions import list_versions, use_version
-from jointfit_daemon.tools.command_group import EXIT_FAILED
+from jointfit_daemon.tools.command_group import EXIT_FAILED, is_given
 from jointfit_daemon.tools.completion import complete_rig_or_command
 from jointfit_daemon.tools.stop_signals import cancel_on_signal
 
@@ -111,6 +111,7 @@ _Force = Annotated[
 
 
 def calibrate(
+    context: typer.Context,
     config: _Config = Path("rig.toml"),
     *,
     phase: _Phases = None,
@@ -147,6 +148,7 @@ def calibrate(
             "expected one of --phase, --abort, --list, --use, --revert and --recording"
         )
     if recording is not None:
+        _check_no_config(context, config)
         status = calibrate_offline(recording, rig, out)
         _print_status(status, json=json)
         return
@@ -167,6 +169,15 @@ def calibrate(
     except OutputLostError:
         raise typer.Exit(EXIT_FAILED) from None
     _print_status(status, json=json)
+
+
+def _check_no_config(context: typer.Context, config: Path) -> None:
+    """Raise ValueError if the command line has a rig.toml that ``--recording`` does not use."""
+    if is_given(context, "config"):
+        raise ValueError(
+            f"{config}: --recording uses the recorded rig.toml; write --rig {config} to replace it,"
+            " or omit this argument"
+        )
 
 
 def _print_status(status: Mapping[str, Any], *, json: bool) -> None:

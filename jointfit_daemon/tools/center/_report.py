@@ -24,7 +24,13 @@ _FLAGS = {
     "residuals_repeat": "residuals repeat with posture, as soft-tissue artefact does: repetitions"
     " of the movement are counted once",
     "hinge": "rotation about one axis: the position of the centre along the axis is unobservable",
+    "marker_off": "the path of marker % contradicts the other markers, so it has a small weight:"
+    " check its label and its attachment",
+    "noisy_marker": "marker % has much larger residuals than the other markers, so it has a small"
+    " weight: check its label and its attachment",
+    "marker_moved": "marker % moved on its segment: only its frames after the movement are used",
 }
+"""Sentences by the part of a flag before the colon; % is the part after the colon."""
 _WINDOW_HEAD = (
     "window, s",
     "x, y, z in parent, mm",
@@ -100,8 +106,13 @@ def details(answer: WindowEstimate) -> str:
     if e.axis is not None:
         lines.append(f"axis      {_direction(e.axis)} of the parent: hinge joint")
 
-    lines += [f"note      {_FLAGS.get(flag, flag.replace('_', ' '))}" for flag in e.flags]
+    lines += [f"note      {_sentence(flag)}" for flag in e.flags]
     return "\n".join(lines)
+
+
+def _sentence(flag: str) -> str:
+    kind, _, marker = flag.partition(":")
+    return _FLAGS.get(kind, kind.replace("_", " ")).replace("%", marker)
 
 
 def error_seen(answer: WindowEstimate) -> float:

@@ -173,7 +173,8 @@ def reduce(
 def _with_residuals(
     reduced: ParentFrameMotion, trial: MarkerTrial, markers: Sequence[str]
 ) -> ParentFrameMotion:
-    movement = replace(reduced.movement, residuals=trial.residuals(markers))
+    residuals, names = trial.residuals(markers), tuple(markers)
+    movement = replace(reduced.movement, residuals=residuals, names=names)
     return replace(reduced, movement=movement)
 
 

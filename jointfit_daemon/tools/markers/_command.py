@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, cast, get_args
 
 import typer
 
-from jointfit_daemon.tools.command_group import EXIT_FAILED
+from jointfit_daemon.tools.command_group import EXIT_FAILED, is_given
 from jointfit_daemon.tools.markers import _report
 from jointfit_daemon.tools.output_files import check_output, check_plot
 from jointfit_daemon.tools.text_output import check_choice, echo_json
@@ -47,7 +47,11 @@ Method = Annotated[
 ]
 Prior = Annotated[
     float,
-    typer.Option("--prior", min=0.0, help="Cost of a displacement relative to the tracking error."),
+    typer.Option(
+        "--prior",
+        min=0.0,
+        help="Cost of a displacement relative to the tracking error; not for search.",
+    ),
 ]
 Cost = Annotated[
     str,
@@ -62,7 +66,10 @@ Weights = Annotated[
 Evenness = Annotated[
     float,
     typer.Option(
-        "--evenness", min=0.0, max=8.0, help="Each trial is weighted by its error to this power."
+        "--evenness",
+        min=0.0,
+        max=8.0,
+        help="Each trial is weighted by its error to this power; not for search.",
     ),
 ]
 Holdout = Annotated[
@@ -71,7 +78,8 @@ Holdout = Annotated[
         "--holdout",
         min=0.0,
         max=0.5,
-        help="Share at the end of each trial that is not fitted and decides when the fit stops.",
+        help="Share at the end of each trial that is not fitted and decides when the fit stops; not"
+        " for search.",
     ),
 ]
 Frames = Annotated[
@@ -99,6 +107,7 @@ Plot = Annotated[Path | None, typer.Option("--plot", help="Plot the result: .png
 
 
 def markers(
+    context: typer.Context,
     trials: Trials,
     *,
     model: Model,
@@ -132,7 +141,7 @@ def markers(
     from jointfit_daemon.tools.markers._output import ENDINGS
     from jointfit_daemon.tools.markers._trials import ModelRequest
 
-    chosen = _loss(method, cost)
+    chosen = _loss(context, method, cost)
     check_choice("--up", up, "xyz")
     if threshold > first_step:
         raise ValueError(f"--threshold is {threshold:g} mm, expected --first-step or less")
@@ -155,15 +164,31 @@ def markers(
     _write_result(chain, remarks, found, out or (), plot, as_json=json)
 
 
-def _loss(method: str, cost: str) -> tuple[RefinementMethod, RefinementCost]:
-    """Return the checked method and cost."""
+def _loss(
+    context: typer.Context, method: str, cost: str
+) -> tuple[RefinementMethod, RefinementCost]:
+    """Return the checked method and cost; refuse other options that the method does not use."""
     from jointfit_daemon.calibration import RefinementCost, RefinementMethod
 
     check_choice("--method", method, get_args(RefinementMethod))
     check_choice("--cost", cost, get_args(RefinementCost))
     if cost == "l1" and method == "search":
         raise ValueError("--cost l1 is for --method joint or block: search has no loss function")
+    _check_options(context, method)
     return cast("RefinementMethod", method), cast("RefinementCost", cost)
+
+
+def _check_options(context: typer.Context, method: str) -> None:
+    """Raise ValueError for an option on the command line that the method does not use."""
+    from jointfit_daemon.calibration import METHODS_OF_OPTION
+
+    for name, methods in METHODS_OF_OPTION.items():
+        if method not in methods and is_given(context, name):
+            option = f"--{name.replace('_', '-')}"
+            raise ValueError(
+                f"{option} is for --method {' or '.join(methods)}: {method} does not use it; remove"
+                " the option, or choose another method"
+            )
 
 
 def _refine_markers(

@@ -97,10 +97,15 @@ def _summary(found: Refinement) -> list[str]:
 
     gauge = found.gauge
     if gauge.free:
+        remedy = (
+            "use --method joint or block, which have a prior"
+            if found.method == "search"
+            else "set a prior"
+        )
         held = {
             "prior": "determined by the prior only",
             "nothing": "UNDETERMINED: joint angles are arbitrary there; lock anatomical"
-            " markers or set a prior",
+            f" markers or {remedy}",
         }[gauge.fixed_by]
         lines.append(
             f"gauge     {gauge.free} motions of markers and angles leave the error unchanged"

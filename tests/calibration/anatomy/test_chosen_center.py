@@ -160,3 +160,15 @@ def test_rotations_from_imus_equal_those_from_markers() -> None:
             other[known], scalar_first=True
         )
         assert np.degrees(np.median(gap.magnitude())) < 0.5
+
+
+@pytest.mark.parametrize("method", ["grid", "three_frames"])
+def test_marker_that_contradicts_the_others_is_flagged_by_its_name(method: CenterMethod) -> None:
+    tracks, turned = recorded()
+    points = tracks["shank"].points.copy()
+    points[:, 1] += rotation.rotate(tracks["thigh"].q, np.array([0.0, 0.12, 0.05]))
+    shifted = {**tracks, "shank": replace(tracks["shank"], points=points)}
+    found = find_anatomy(CHAIN, shifted, CenterChoice({"knee": method}, turned)).joints["knee"]
+    assert found is not None
+    assert found.fit is not None
+    assert [flag for flag in found.fit.flags if ":" in flag] == ["marker_off:shank1"]

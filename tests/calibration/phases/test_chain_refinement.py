@@ -16,6 +16,7 @@ from jointfit_daemon.calibration import (
     FunctionalJob,
     JobControl,
     OpticalTrack,
+    RefinementMethod,
 )
 from jointfit_daemon.calibration.marker_refinement import RefinementSettings, with_locks
 from jointfit_daemon.calibration.phases import run_job
@@ -180,12 +181,18 @@ def test_models_that_do_not_fit_are_refused_by_name() -> None:
     found = refine_chain(trials()[1], wanted(scaled), JobControl())
     assert found.chain is None
     assert found.figures is not None
-    assert "scale the model first" in str(found.figures.refused)
+    assert str(found.figures.refused).count("scale the model first") == 1
     assert found.notes[0].startswith("chain model 'leg': markers not refined: functional: ")
 
     renamed = tuple(replace(m, name=f"X{m.name}") for m in true_model().markers)
     found = refine_chain(trials()[1], wanted(replace(true_model(), markers=renamed)), JobControl())
     assert "of the model's markers: check their names" in found.notes[0]
+
+
+def test_size_of_the_model_is_noted_once_for_both_parts_of_the_movement() -> None:
+    scaled = true_model().scaled(dict.fromkeys(LOCAL, 1.2))
+    found = refine_chain(trials()[1], wanted(scaled), JobControl())
+    assert sum("scale the model" in note for note in found.notes) == 1
 
 
 def test_time_limit_ends_the_iteration_with_the_reason() -> None:
@@ -215,6 +222,22 @@ def test_search_stops_between_two_coordinates() -> None:
     )
     assert found.figures is not None
     assert found.figures.stopped == "stopped after 3 s"
+
+
+@pytest.mark.parametrize(
+    ("method", "remedy"), [("joint", "or set prior"), ("search", "or use method joint or block")]
+)
+def test_remedy_for_undetermined_markers_is_one_of_the_method(
+    method: RefinementMethod, remedy: str
+) -> None:
+    free = with_locks(nominal(), ["*"], "", locked=False)
+    settings = RefinementSettings(method, 0.0, frames=20)
+    refinement = ChainRefinement(free, settings, 5.0)
+    found = refine_chain(
+        trials()[1], replace(wanted(), chain_refinement=refinement), JobControl(lambda: 0.0)
+    )
+    (note,) = [note for note in found.notes if "not determined by the movement" in note]
+    assert note.endswith(remedy)
 
 
 def test_refinement_is_off_without_a_model_or_with_refine_markers_off() -> None:

@@ -127,6 +127,23 @@ def test_text_report_contains_markers_trials_and_gauge(folder: Path) -> None:
     assert "nan" not in result.stdout
 
 
+@pytest.mark.parametrize(
+    ("options", "remedy"),
+    [
+        (("--prior", "0"), "lock anatomical markers or set a prior"),
+        (("--method", "search"), "markers or use --method joint or block, which have a prior"),
+    ],
+)
+def test_remedy_for_undetermined_markers_is_one_of_the_method(
+    folder: Path, options: tuple[str, ...], remedy: str
+) -> None:
+    result = run(app, asked(folder, "--frames", "10", *options))
+    assert result.exit_code == 0, result.stderr
+    (line,) = [line for line in result.stdout.splitlines() if line.startswith("gauge")]
+    assert "UNDETERMINED" in line
+    assert line.endswith(remedy)
+
+
 def test_a_lock_on_a_marker_with_a_dot_in_its_name_holds_it_whole(folder: Path) -> None:
     found = answer(folder, "--lock", "T3.x")
     held = {m["name"]: m["held"] for m in found["markers"]}
@@ -174,7 +191,16 @@ def test_opensim_reads_the_marker_set(folder: Path) -> None:
         (["--method", "magic"], 2, ["joint, block or search"]),
         (["--out", "new.osim"], 2, [".toml, .json, .xml or .trc"]),
         (["--up", "w"], 2, ["x, y or z"]),
-        (["--threshold", "9"], 2, ["--threshold is 9 mm", "--first-step or less"]),
+        (
+            ["--method", "search", "--threshold", "9"],
+            2,
+            ["--threshold is 9 mm", "--first-step or less"],
+        ),
+        (["--first-step", "8"], 2, ["--first-step is for --method search: joint does not use it"]),
+        (["--method", "block", "--threshold", "2"], 2, ["--threshold is for --method search"]),
+        (["--method", "search", "--prior", "0.5"], 2, ["--prior is for --method joint or block"]),
+        (["--method", "search", "--holdout", "0.2"], 2, ["--holdout is for --method joint or b"]),
+        (["--method", "search", "--evenness", "1"], 2, ["--evenness is for --method joint or b"]),
         (["--lock", "*"], 1, ["all coordinates are locked"]),
         (["--validate", "nowhere.trc"], 2, ["nowhere.trc"]),
     ],
