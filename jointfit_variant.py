@@ -1,6 +1,7 @@
 """Selection between the compiled and the interpreted form of a module.
 
-A compiled wheel contains extension modules beside the sources of the frame's path (docs/speed.md).
+For the modules that compute a frame, a compiled wheel contains extension modules beside the
+sources (docs/speed.md).
 Python imports an extension module rather than the source of the same name. With ``JOINTFIT_PURE=1``
 in the environment, the packages of the project import their sources.
 
@@ -18,16 +19,17 @@ if TYPE_CHECKING:
     from importlib.machinery import FileFinder
 
 _PROBE = "jointfit_daemon.kinematics.rotation_scalar"
-"""A module that every compiled wheel compiles, in packages that import nothing."""
+"""A module that is compiled in every compiled wheel."""
 
 _roots: list[str] = []
 """Folders of the packages that import their sources."""
 
 
 def select_variant(folders: Iterable[str]) -> None:
-    """Import the sources of the package in `folders` if ``JOINTFIT_PURE`` is 1.
+    """Make later imports from the package in `folders` use the sources if ``JOINTFIT_PURE`` is set.
 
-    Called by the ``__init__`` of a package with its ``__path__``, before its other modules exist.
+    Called by the ``__init__`` of a package with its ``__path__``, before its other modules are
+    imported.
     """
     if os.environ.get("JOINTFIT_PURE", "0") in {"", "0"}:
         return

@@ -8,8 +8,8 @@ r"""Ridge regression on smooth terms and bumps (kernels); stacking combines the 
 
 for every axis j. The index p counts the pairs of a penalty :math:`\lambda` and a ratio r, n is the
 number of frames, w are the weights of the frames with mean 1, h the Huber weights of the final fit,
-g the regressors, and :math:`\hat\rho` the predictions of held-out frames (stacking: Breiman
-1996). Regressors are not centered, because
+g the regressors, :math:`\rho` the target corrections in rad, and :math:`\hat\rho` their
+predictions in held-out frames (stacking: Breiman 1996). Regressors are not centered, because
 the regression must have no intercept. The shares a may sum to less than 1. The part of the
 correction that does not generalize to held-out frames is then omitted.
 """
