@@ -1,7 +1,7 @@
 """Prior that a subject stands upright in the static pose, combined with joint centers.
 
 If the arc of the movement is short, a center from skin markers has an uncertainty of centimeters
-perpendicular to the limb. The uncertainty is largest at the ankle. Subjects who are asked to stand
+perpendicular to the limb. The uncertainty is largest at the ankle. Subjects that are asked to stand
 upright do so within a few degrees. The movement and the pose are weighted by their covariances, in
 a linear Gaussian model.
 

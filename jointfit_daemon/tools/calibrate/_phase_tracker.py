@@ -86,6 +86,8 @@ class PhaseTracker:
 
     def on_progress(self, payload: Mapping[str, Any]) -> None:
         """Process a message of topic ``calibration/progress``."""
+        if payload.get("phase") == "aborted":  # the error message of the command has the reason
+            return
         done = payload.get("progress") or 0.0
         self.show(str(payload.get("phase", "")), float(done), str(payload.get("text", "")))
         if self.show_details is not None:

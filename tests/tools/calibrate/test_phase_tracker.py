@@ -145,6 +145,13 @@ def test_details_are_shown_after_their_progress() -> None:
     assert told == [("functional", 0.5, "on"), {"joints": {}}]
 
 
+def test_reason_of_an_abort_is_left_to_the_error_message() -> None:
+    told: list[object] = []
+    one = PhaseTracker(lambda *said: told.append(said), told.append)
+    one.on_progress({"phase": "aborted", "progress": None, "text": "C1 moves by 159 mm"})
+    assert told == []
+
+
 @pytest.mark.parametrize("terminal", [True, False])
 def test_result_that_is_not_stored_is_printed_once(
     monkeypatch: pytest.MonkeyPatch, terminal: bool
