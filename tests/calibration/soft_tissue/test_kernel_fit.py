@@ -146,6 +146,10 @@ def test_errors_beyond_the_training_are_claimed_larger_than_shown() -> None:
     assert np.all((within > 0.014) & (within < 0.026))
     assert np.all(np.array(near.at(2.0)) > 1.5 * within)
 
+    # The prior observation, three times the RMS error at r = 1.5, has most of the influence there.
+    ratios = np.array(near.at(1.5)) / within
+    assert np.all((ratios > 2.4) & (ratios < 3.0))
+
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_long_pauses_in_the_training_hardly_change_the_error_in_movement(seed: int) -> None:
