@@ -35,8 +35,9 @@ if TYPE_CHECKING:
 
 MOST_MOVEMENT_M = 0.03
 """Upper quartile of the movement of a marker in the frame of the other markers above which the
-marker may be on another part, m. Soft-tissue artefact of skin markers is 5 to 10 mm RMS, and up to
-20 to 30 mm at the thigh."""
+marker may be on another part, m. Soft-tissue artefact of skin markers is largest at the thigh,
+where it exceeds 20 mm (Leardini et al. 2005, Gait & Posture 21, 212-225). Such a marker is reported
+only if it moves with another part."""
 MOST_DISTANCE_CHANGE_M = 0.04
 """Upper quartile of the change of a distance above which two markers are on different parts, m. It
 is the change for two markers with independent artefacts of 30 mm."""

@@ -146,7 +146,7 @@ def test_errors_beyond_the_training_are_claimed_larger_than_shown() -> None:
     assert np.all((within > 0.014) & (within < 0.026))
     assert np.all(np.array(near.at(2.0)) > 1.5 * within)
 
-    # The prior observation, three times the RMS error at r = 1.5, has most of the influence there.
+    # The prior observation is three times the RMS error at r = 1.5.
     ratios = np.array(near.at(1.5)) / within
     assert np.all((ratios > 2.4) & (ratios < 3.0))
 
