@@ -117,11 +117,12 @@ class RecordingMachine(RuleBasedStateMachine):
 
     @rule()
     def stop(self) -> None:
+        writer = self.recorder._writer
         health = self.complete(self.recorder.stop())
         assert not health.active
         assert health == self.recorder.health()
-        if health.file:
-            assert health.lost == self.writers[-1].lost
+        if writer is not None:
+            assert health.lost == writer.lost
         self.unsafe = []
 
     @rule()
