@@ -115,7 +115,10 @@ class MocapFrame:
 
 @dataclass(frozen=True, slots=True)
 class ClockEcho:
-    """One exchange with a device: host stamps of request and reply, and device ticks in between."""
+    """One echo: the host requests the time of a device, and the device replies with its ticks.
+
+    The clock offset is estimated from the ticks and the host times of request and reply.
+    """
 
     sent_ns: int
     received_ns: int
@@ -206,8 +209,8 @@ class Chain:
     """A limb: joints O1 to On+1 from proximal to distal, and the n segments between them.
 
     In a branched limb, joint i is the proximal joint of segment i. The joints after the last
-    segment are the distal ends of the branches. A segment always follows its proximal segment in
-    the order. The first segment has two distal joints, and O1 is the midpoint between them.
+    segment are the distal ends of the branches. In `segments`, a segment always comes after its
+    proximal segment. The first segment has two distal joints, and O1 is the midpoint between them.
     """
 
     joints: tuple[str, ...]
@@ -218,8 +221,8 @@ class Chain:
     """Whether the limb is on the left side, where adduction and rotation have the opposite sign
     (CONVENTIONS.md)."""
     origin: Vector | None = None
-    """Fixed position of O1 in the world, m. If None, O1 is at the origin or at its optical
-    position."""
+    """Fixed position of O1 in the world, m. If None, O1 is at the origin of the world, or at the
+    position that the cameras measure."""
     lengths: tuple[float | None, ...] = ()
     """Configured segment lengths, m; None if calibration estimates them."""
     proximal: str | None = None
@@ -390,7 +393,8 @@ class OpticalJoint(NamedTuple):
     position: Vector | None
     """Mean of the joint centers fixed in the two adjacent body parts, m."""
     gap: float | None
-    """Distance between these two centers, m; None unless both body parts are visible."""
+    """Distance between the two joint centers whose mean is `position`, m; None unless both body
+    parts are visible."""
     distance: float | None
     """Distance between the positions from the IMUs and from the cameras, m."""
     distance_rms: float | None
@@ -424,8 +428,8 @@ class RunningCenter(NamedTuple):
     center: Vector | None = None
     """Position of the center, m."""
     covariance: tuple[Vector, Vector, Vector] | None = None
-    """Covariance of the center, m², which is 0 along `unseen`. If the residuals persist, all frames
-    together count as one observation of the soft-tissue artefact."""
+    """Covariance of the center, m², which is 0 along `unseen`. Residuals from soft-tissue artefact
+    repeat with posture, so all frames together count as one observation of these residuals."""
     unseen: tuple[Vector, ...] = ()
     """Unit directions along which the center was not observed. Their largest component is positive.
     """
@@ -450,7 +454,7 @@ class RunningCenters(NamedTuple):
 
     t_ns: int
     memory_s: float
-    """Time constant of the weights, s."""
+    """Time constant with which the weights of older camera frames decrease, s."""
     joints: tuple[RunningCenter, ...]
 
 
@@ -504,6 +508,9 @@ class ChainModelState(NamedTuple):
     """Errors of the markers over the last seconds."""
     flags: tuple[str, ...]
     """Values of `MarkerFlag`, each with the names of the markers concerned."""
+    covariance: tuple[tuple[float, ...], ...] | None = None
+    """Rows of the covariance matrix of the coordinates that have a value, rad and m, in the order
+    of `coordinates`; None unless rig.toml requests it."""
 
 
 class PlanarJoint(NamedTuple):

@@ -355,6 +355,7 @@ class MqttSettings(Settings):
         le=100,
         description="greatest rate of the topic optical/chain, Hz; 0: no inverse kinematics",
     )
+    chain_covariance: bool = Field(default=False, description="publish covariance in optical/chain")
     sensors_hz: float = Field(
         0.0, ge=0, le=1000, description="greatest rate of the topic sensors/pose, Hz; 0: none"
     )

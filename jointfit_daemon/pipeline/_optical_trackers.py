@@ -30,13 +30,16 @@ def chain_tracker(
     refined = None if stored is None else stored.apply(rig.chain_model.chain)
     loaded = rig.chain_model if refined is None else replace(rig.chain_model, chain=refined)
     rate_hz, is_refined = rig.mqtt.chain_hz, refined is not None
-    if before is not None and before.serves(loaded, rate_hz, refined=is_refined):
+    covariance = rig.mqtt.chain_covariance
+    if before is not None and before.serves(
+        loaded, rate_hz, refined=is_refined, covariance=covariance
+    ):
         return before
     from jointfit_daemon.pipeline.chain_tracking import (  # noqa: PLC0415 - it loads scipy
         ChainTracker,
     )
 
-    return ChainTracker(loaded, rig.mqtt.chain_hz, refined=refined is not None)
+    return ChainTracker(loaded, rate_hz, refined=is_refined, covariance=covariance)
 
 
 def planar_tracker(rig: Rig, before: PlanarTracker | None) -> PlanarTracker | None:

@@ -216,11 +216,12 @@ def test_reload_preserves_the_consistency_monitor() -> None:
     [
         ({"pose_ui_hz": 20.0}, (True, True)),
         ({"chain_hz": 5.0}, (False, True)),
+        ({"chain_covariance": True}, (False, True)),
         ({"centers_memory_s": 7.0}, (True, False)),
     ],
 )
 def test_reload_keeps_chain_tracking_and_running_centers_whose_configuration_is_the_same(
-    changed: dict[str, float], kept: tuple[bool, bool]
+    changed: dict[str, float | bool], kept: tuple[bool, bool]
 ) -> None:
     rig = shaped({"S1": "thigh", "S3": "shank"}, mocap=True)
     rig["mocap"]["markers"] = {"thigh": ["T1", "T2", "T3"], "shank": ["C1", "C2", "C3"]}

@@ -111,7 +111,7 @@ class CoordinateTracker:
         self._last = np.full(ends[-1], np.nan)
 
     def read(self, state: ChainState, covariance: Array) -> tuple[Array, Array]:
-        """Return values and standard deviations, rad and m, shape (K,).
+        """Return the values of the K coordinates, rad and m, and their covariance.
 
         Parameters
         ----------
@@ -122,9 +122,12 @@ class CoordinateTracker:
 
         Returns
         -------
-        values, sd
-            Arrays with angles within ±180°. They contain NaN for a joint whose search has not
+        values
+            Values, shape (K,), with angles within ±180°; NaN for a joint whose search has not
             ended, for example because its coordinates cannot describe the pose.
+        covariance
+            R C R^T, shape (K, K), with the derivatives R of the coordinates with respect to a step
+            and the covariance C of the step; NaN for coordinates without a value.
         """
         values, rates = np.full(len(self._last), np.nan), self._rates.copy()
         for i, c in zip(self._coupled, self._couplings, strict=True):
@@ -149,8 +152,8 @@ class CoordinateTracker:
             self._invert(waiting, state, values, rates)
 
         self._last = values
-        variances = ((rates @ covariance) * rates).sum(axis=1)
-        return values, np.where(np.isnan(values), np.nan, np.sqrt(variances))
+        unknown = np.isnan(values)
+        return values, np.where(unknown[:, None] | unknown, np.nan, rates @ covariance @ rates.T)
 
     def _invert(self, numbers: list[int], state: ChainState, values: Array, rates: Array) -> None:
         """Write values and rates of joints without closed form; NaN if the values are unknown."""

@@ -145,6 +145,13 @@ class ChainCoordinate(Table):
     sd_m: Number = None
 
 
+class ChainCovariance(Table):
+    """Covariance of the coordinates with a value."""
+
+    names: list[str]
+    rows: list[list[float]] = Field(description="rows of the matrix, in degrees and metres")
+
+
 class FitErrors(Table):
     """Marker errors of one fit."""
 
@@ -161,6 +168,7 @@ class OpticalChain(Payload):
     model: str
     refined: Any = Field(description="refinement of the model in use")
     coordinates: dict[str, ChainCoordinate]
+    covariance: ChainCovariance | None = None
     error_m: dict[str, Number]
     fit: FitErrors | None
     recent: FitErrors | None

@@ -55,7 +55,7 @@ def encode(payload: Mapping[str, Any]) -> bytes:
     """Return `payload` as JSON.
 
     An integer that a browser would round becomes null. A lone surrogate becomes a question mark.
-    Both occur in data of devices and in file names.
+    Data of devices and file names may contain these values.
     """
     try:
         return orjson.dumps(payload, _to_json, _OPTIONS)
@@ -159,6 +159,7 @@ def encode_sensors(states: SensorStates, offset_ns: int) -> bytes:
 
 def encode_chain(state: ChainModelState, offset_ns: int) -> bytes:
     """Return the payload of ``optical/chain``; `offset_ns` is described at `encode_pose`."""
+    covariance = {} if state.covariance is None else {"covariance": _chain_covariance(state)}
     return encode(
         {
             "v": PAYLOAD_VERSION,
@@ -167,6 +168,7 @@ def encode_chain(state: ChainModelState, offset_ns: int) -> bytes:
             "model": state.model,
             "refined": state.refined,
             "coordinates": {one.name: _coordinate(one) for one in state.coordinates},
+            **covariance,
             "error_m": {name: _metres(error) for name, error in state.errors.items()},
             "fit": _fit_errors(state.fit),
             "recent": _fit_errors(state.recent),
@@ -179,6 +181,17 @@ def _coordinate(one: ModelCoordinate) -> dict[str, float | None]:
     if one.is_angle:
         return {"value_deg": _degrees(one.value), "sd_deg": _degrees(one.sd)}
     return {"value_m": _metres(one.value), "sd_m": _metres(one.sd)}
+
+
+def _chain_covariance(state: ChainModelState) -> dict[str, Any]:
+    """Return the covariance of the coordinates with a value, in the units of the coordinates."""
+    known = [one for one in state.coordinates if one.value is not None]
+    units = [180.0 / pi if one.is_angle else 1.0 for one in known]
+    rows = [
+        [float(f"{a * b * value:.4g}") for b, value in zip(units, row, strict=True)]
+        for a, row in zip(units, state.covariance or (), strict=True)
+    ]
+    return {"names": [one.name for one in known], "rows": rows}
 
 
 def _fit_errors(errors: MarkerFitErrors | None) -> dict[str, Any] | None:

@@ -6,8 +6,7 @@ Invariant: the result depends neither on an IMU nor on a calibration of the limb
 from __future__ import annotations
 
 from collections import deque
-from itertools import islice
-from math import isfinite, sqrt
+from math import sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -41,12 +40,17 @@ FEWEST_MARKERS = 3
 """Smallest number of markers in a frame for a solution. Fewer markers do not determine the position
 of the first segment."""
 _FEW_EVALUATIONS = 8
-"""Largest number of evaluations of the marker errors in a frame that leaves time for the search of
-labels in the same frame."""
+"""Largest number of evaluations of the marker errors in a frame, after which there is still time to
+search for exchanged labels in the same frame."""
 OPTIONS = LiveOptions(steps=6, huber_m=0.02, restart_interval=5)
-"""Options of the solver. It takes up to six steps per frame, because frames are 100 ms apart. The
-Huber threshold limits the influence of an exchanged marker until it is excluded. A restart takes
-longer than the fit of a frame, so the solver restarts less often after unsuccessful restarts."""
+"""Options of the solver. The solver takes up to six steps per frame, because frames are 100 ms
+apart. The Huber threshold limits the influence of an exchanged marker until it is excluded. A
+restart computes the pose from the markers alone, without the previous pose, and takes longer than
+the fit of a frame. The solver therefore restarts less often after unsuccessful restarts."""
+
+
+_Coordinates = tuple[tuple[ModelCoordinate, ...], tuple[tuple[float, ...], ...] | None]
+"""Coordinates, and the rows of their covariance matrix if it is requested."""
 
 
 class _FrameErrors(NamedTuple):
@@ -68,10 +72,20 @@ class ChainTracker:
         Largest number of fitted frames per second; above 0.
     refined : bool
         Whether the marker positions come from a calibration.
+    covariance : bool
+        Whether the states contain the covariance of the coordinates.
     """
 
-    def __init__(self, loaded: LoadedModel, rate_hz: float, *, refined: bool = False) -> None:
-        self.loaded, self._rate_hz, self._refined = loaded, rate_hz, refined
+    def __init__(
+        self,
+        loaded: LoadedModel,
+        rate_hz: float,
+        *,
+        refined: bool = False,
+        covariance: bool = False,
+    ) -> None:
+        self.loaded, self._options = loaded, (rate_hz, refined, covariance)
+        self._refined, self._with_covariance = refined, covariance
         self._model = model = loaded.chain
         self._solver = LiveInverseKinematics(model, OPTIONS)
         self._monitor = MarkerMonitor(model)
@@ -88,12 +102,19 @@ class ChainTracker:
         self._columns: list[int | None] = []
         self._recent: deque[_FrameErrors] = deque()
 
-    def serves(self, loaded: LoadedModel, rate_hz: float, *, refined: bool) -> bool:
+    def serves(
+        self, loaded: LoadedModel, rate_hz: float, *, refined: bool, covariance: bool
+    ) -> bool:
         """Return whether a new tracker with these arguments would be equivalent to this tracker."""
         names = [joint.names for joint in loaded.coordinates]
         same_names = names == [joint.names for joint in self.loaded.coordinates]
-        same_settings = (self._rate_hz, self._refined) == (rate_hz, refined)
+        same_settings = self._options == (rate_hz, refined, covariance)
         return same_settings and same_names and self._model == loaded.chain
+
+    @property
+    def exchanged_labels(self) -> list[str]:
+        """Sentences that name the markers whose labels are exchanged at present."""
+        return self._monitor.exchanged_labels()
 
     def add_frame(self, t_ns: int, frame: MocapFrame) -> list[Output]:
         """Return the state of the model if a state is due for this live frame, and notices."""
@@ -116,7 +137,7 @@ class ChainTracker:
         used: NDArray[np.bool_] = seen & ~self._monitor.excluded & (self._model.weights > 0.0)
         names = self._model.marker_names
         if used.sum() < FEWEST_MARKERS:
-            state = self._state(t_ns, frame, self._unknown, dict.fromkeys(names), None)
+            state = self._state(t_ns, frame, (self._unknown, None), dict.fromkeys(names), None)
             return [state, *_notices(t_ns, reports)]
 
         pose = self._solver.feed(np.where(used[:, None], measured, np.nan))
@@ -132,17 +153,20 @@ class ChainTracker:
         state = self._state(t_ns, frame, self._values(pose), shown, fit)
         return [state, *_notices(t_ns, [*reports, *faults])]
 
-    def _values(self, pose: LivePose) -> tuple[ModelCoordinate, ...]:
-        values, sd = self._coordinates.read(pose.state, pose.covariance)
-        found = iter(zip(self._unknown, values.tolist(), sd.tolist(), strict=True))
-        known = np.logical_and.reduceat(pose.determined, self._starts).tolist()
-        return tuple(
-            ModelCoordinate(one.name, one.is_angle, value, spread)
-            if joint_is_known and isfinite(value)
-            else one
-            for joint_is_known, count in zip(known, self._counts, strict=True)
-            for one, value, spread in islice(found, count)
+    def _values(self, pose: LivePose) -> _Coordinates:
+        values, covariance = self._coordinates.read(pose.state, pose.covariance)
+        joint_is_known = np.logical_and.reduceat(pose.determined, self._starts)
+        known = np.repeat(joint_is_known, self._counts) & np.isfinite(values)
+        sd = np.sqrt(covariance.diagonal())
+        coordinates = tuple(
+            ModelCoordinate(one.name, one.is_angle, value, spread) if is_known else one
+            for one, value, spread, is_known in zip(
+                self._unknown, values.tolist(), sd.tolist(), known.tolist(), strict=True
+            )
         )
+        if not self._with_covariance:
+            return coordinates, None
+        return coordinates, tuple(map(tuple, covariance[np.ix_(known, known)].tolist()))
 
     def _errors(self, t_ns: int, distances: Array) -> MarkerFitErrors:
         square, maximum = float((distances**2).sum()), float(distances.max())
@@ -153,7 +177,7 @@ class ChainTracker:
         self,
         t_ns: int,
         frame: MocapFrame,
-        coordinates: tuple[ModelCoordinate, ...],
+        found: _Coordinates,
         errors: dict[str, float | None],
         fit: MarkerFitErrors | None,
     ) -> ChainModelState:
@@ -164,6 +188,7 @@ class ChainTracker:
             _, squares, counts, largest = zip(*self._recent, strict=True)
             recent = _fit_errors(sum(squares), sum(counts), max(largest))
 
+        coordinates, covariance = found
         open_ones = any(coordinate.value is None for coordinate in coordinates)
         flags = [MarkerFlag.UNDETERMINED.value] if open_ones else []
         return ChainModelState(
@@ -176,6 +201,7 @@ class ChainTracker:
             fit,
             recent,
             (*flags, *self._monitor.flags(t_ns)),
+            covariance,
         )
 
 

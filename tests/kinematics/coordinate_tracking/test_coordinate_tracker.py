@@ -56,9 +56,27 @@ def test_values_and_standard_deviations_equal_those_of_the_table(seed: int) -> N
     table = coordinate_table(MODEL, state, covariance[None], COORDINATES)
     if np.abs(table.values[0, [1, 7]]).max() > 1.4:
         return  # near a gimbal lock, rounding errors of the pose cause large angle errors
-    values, sd = CoordinateTracker(MODEL, COORDINATES).read(state, covariance)
+    values, found = CoordinateTracker(MODEL, COORDINATES).read(state, covariance)
     np.testing.assert_allclose(values, table.values[0], atol=RESOLUTION)
-    np.testing.assert_allclose(sd, table.sd[0], rtol=5e-3)
+    np.testing.assert_allclose(np.sqrt(found.diagonal()), table.sd[0], rtol=5e-3)
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 10_000))
+def test_covariance_of_coordinates_is_the_covariance_of_small_steps(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    state = apply_step(MODEL, rest_state(MODEL), rng.normal(0.0, 0.3, (1, MODEL.nq)))
+    root = rng.normal(0.0, 0.02, (MODEL.nq, MODEL.nq))
+    values, found = CoordinateTracker(MODEL, COORDINATES).read(state, root @ root.T)
+
+    # Coordinates after small steps, from a new tracker each time.
+    def moved(step: Array) -> Array:
+        tracker = CoordinateTracker(MODEL, COORDINATES)
+        return tracker.read(apply_step(MODEL, state, step[None]), np.eye(MODEL.nq))[0]
+
+    slopes = np.stack([(moved(1e-6 * e) - values) / 1e-6 for e in np.eye(MODEL.nq)], axis=1)
+    expected = slopes @ root @ root.T @ slopes.T
+    np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
 
 
 def test_each_instant_begins_at_the_one_before() -> None:
@@ -92,9 +110,9 @@ def test_a_joint_of_two_angles_has_coordinates_although_noise_leaves_a_third() -
         step[0, model.columns[1]] = rng.normal(0.0, 0.01, 3)
         step[0, model.columns[1].start] += 0.5 * np.sin(0.1 * k)
         state = apply_step(model, rest_state(model), step)
-        values, sd = tracker.read(state, covariance)
+        values, found = tracker.read(state, covariance)
         assert values[-2:] == pytest.approx([0.5 * np.sin(0.1 * k), 0.0], abs=0.05)
-        assert np.isfinite(sd).all()
+        assert np.isfinite(found).all()
 
 
 MOST_STEPS = 8
@@ -158,10 +176,10 @@ def test_perpendicular_axes_have_a_closed_form_that_equals_the_table(
 
     tracker = CoordinateTracker(BALL, coordinates)
     calls[0] = 0
-    found, sd = tracker.read(state, root @ root.T)
+    found, covariance = tracker.read(state, root @ root.T)
     assert calls == [0]
     np.testing.assert_allclose(found, values, atol=1e-9)
-    np.testing.assert_allclose(sd, table.sd[0], rtol=1e-5)
+    np.testing.assert_allclose(np.sqrt(covariance.diagonal()), table.sd[0], rtol=1e-5)
 
 
 def test_oblique_axes_are_inverted_in_few_steps_an_instant() -> None:
@@ -174,11 +192,11 @@ def test_oblique_axes_are_inverted_in_few_steps_an_instant() -> None:
         values = np.array([np.sin(0.1 * k) + 2.0 * (k > 30), 0.4 * np.cos(0.2 * k), 0.05 * k - 2.0])
         A = thigh.pose(values[None])[0][0]
         calls[0] = 0
-        found, sd = tracker.read(ball_state(A), covariance)
+        found, spread = tracker.read(ball_state(A), covariance)
         assert calls[0] <= MOST_STEPS
         if k not in (0, 1, 31, 32):
             np.testing.assert_allclose(found[6:], values, atol=RESOLUTION)
-            assert np.isfinite(sd).all()
+            assert np.isfinite(spread).all()
 
 
 def test_a_search_without_result_takes_few_steps_an_instant_until_it_ends() -> None:
@@ -196,10 +214,12 @@ def test_a_search_without_result_takes_few_steps_an_instant_until_it_ends() -> N
     impossible = both(np.array([[0.3, 0.2, 1.5]]))[0][0]
     for _ in range(20):
         calls[0] = 0
-        values, sd = tracker.read(ball_state(impossible), covariance)
+        values, spread = tracker.read(ball_state(impossible), covariance)
         assert calls[0] <= MOST_STEPS
         assert np.isnan(values[6:]).all()
-        assert np.isnan(sd[6:]).all()
+        assert np.isnan(spread[6:]).all()
+        assert np.isnan(spread[:, 6:]).all()
+        assert np.isfinite(spread[:6, :6]).all()
     possible = both(np.array([[0.3, 0.2, 0.0]]))[0][0]
     found = [tracker.read(ball_state(possible), covariance)[0][6:] for _ in range(6)]
     np.testing.assert_allclose(found[-1], [0.3, 0.2], atol=RESOLUTION)

@@ -467,6 +467,31 @@ def test_optical_chain_has_units_by_coordinate_and_null_for_the_unknown() -> Non
     }
 
 
+def test_covariance_of_a_chain_has_the_units_of_the_coordinates_that_are_known() -> None:
+    state = ChainModelState(
+        7,
+        0,
+        "leg",
+        False,
+        (
+            ModelCoordinate("knee", True, 0.5, 0.03),
+            ModelCoordinate("hip", True, None, None),
+            ModelCoordinate("pelvis_tx", False, 0.1, 0.004),
+        ),
+        {},
+        None,
+        None,
+        (),
+        ((9e-4, -6e-5), (-6e-5, 1.6e-5)),
+    )
+    payload = json.loads(encode_chain(state, 0))
+    assert payload["coordinates"]["knee"]["sd_deg"] == pytest.approx(math.sqrt(2.954), abs=0.005)
+    assert payload["covariance"] == {
+        "names": ["knee", "pelvis_tx"],
+        "rows": [[2.955, -0.003438], [-0.003438, 1.6e-05]],
+    }
+
+
 def test_sticks_have_metres_and_null_with_the_reason() -> None:
     figure = StickFigure(
         7,

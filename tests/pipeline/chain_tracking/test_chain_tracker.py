@@ -69,9 +69,12 @@ def track(
     seconds: float,
     change: Callable[[float, Array], Array] = lambda _, points: points,
     rate_hz: float = RATE_HZ,
+    *,
+    covariance: bool = False,
 ) -> tuple[list[ChainModelState], list[Notice]]:
     """Return states and notices of frames at 50 Hz."""
-    tracker = ChainTracker(LoadedModel(model(), default_coordinates(model())), rate_hz)
+    loaded = LoadedModel(model(), default_coordinates(model()))
+    tracker = ChainTracker(loaded, rate_hz, covariance=covariance)
     states: list[ChainModelState] = []
     notices: list[Notice] = []
     layout = MocapLayout(NAMES, ())
@@ -133,6 +136,24 @@ def test_coordinates_follow_the_movement_within_their_standard_deviations() -> N
     assert 0.0012 < last.recent.rms < 0.002
     assert last.recent.maximum >= last.fit.maximum
     assert set(last.errors) == set(NAMES)
+
+
+def test_covariance_contains_the_coordinates_with_a_value() -> None:
+    def hide_foot(t_s: float, points: Array) -> Array:
+        points[13:] = np.nan if t_s > 1.0 else points[13:]
+        return points
+
+    states, _ = track(2.0, hide_foot, covariance=True)
+    for state in states:
+        known = [one for one in state.coordinates if one.value is not None]
+        assert state.covariance is not None
+        assert np.shape(state.covariance) == (len(known), len(known))
+        sd = np.sqrt(np.diagonal(state.covariance)).tolist()
+        assert sd == pytest.approx([one.sd for one in known])
+    first, last = states[0].covariance, states[-1].covariance
+    assert first is not None
+    assert last is not None
+    assert (len(first), len(last)) == (13, 10)
 
 
 def test_a_marker_that_is_lost_for_minutes_is_flagged_and_the_rest_continues() -> None:
