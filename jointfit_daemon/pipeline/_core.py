@@ -1,5 +1,8 @@
 """The core, which converts input events to limb states, notices and calibration jobs.
 
+Input events are, for example, bytes from a device, requests, and the passage of time (`events`). A
+notice is a message about a change, such as a lost sensor.
+
 Invariant: the core is synchronous and deterministic, without clock, I/O, logging or randomness. The
 same events in the same order yield the same outputs, byte for byte, so a recording can be replayed.
 """
@@ -84,8 +87,9 @@ class Core:
     Parameters
     ----------
     observe
-        Function that is called with source and measurement when the instant of the measurement is
-        known, in the order of processing. It must not change the measurement.
+        Function that is called for each measurement, in the order of processing, when the instant
+        of the measurement is known. The arguments are the id of the source and the measurement. It
+        must not change the measurement.
     """
 
     def __init__(self, observe: Callable[[str, StampedMeasurement], None] | None = None) -> None:
@@ -136,7 +140,8 @@ class Core:
 
     def feed(self, event: Event) -> list[Output]:
         """Process one event, and return its outputs in order."""
-        # Chunks are tested first, because thousands of chunks arrive for each other event.
+        # Chunks are tested first, because they are a thousand times more frequent than all other
+        # events.
         if isinstance(event, ChunkArrived):
             self._now_ns = max(self._now_ns, event.chunk.t_ns)
             return self._add_chunk(event)
@@ -247,7 +252,7 @@ class Core:
             return
         no_north = drifting_imus(rig.sources)
         self._fuser = LimbFuser(rig.chain, calibration, self._sensor_monitor, no_north)
-        usable = calibration if calibration and calibration.fits(rig.chain) else None
+        self._usable = usable = calibration if calibration and calibration.fits(rig.chain) else None
 
         self._lags = LagMonitor(rig.chain, usable, self._lags, known_lags(rig))
         self._session.lags = self._lags
@@ -255,7 +260,6 @@ class Core:
         self._lag_ns = dict(calibration.lag_ns) if calibration is not None else {}
         self._lag_ns |= self._lags.known_lags_ns()
         self._comparison = OpticalComparison(rig.chain, usable, rig.mqtt.optical_hz)
-        self._usable = usable
         self._sensors_rate = RateDivider(rig.mqtt.sensors_hz) if rig.mqtt.sensors_hz > 0.0 else None
         centers = MovingCenters(rig.chain, usable, rig.mqtt.centers_memory_s)
         if self._moving_centers is None or not self._moving_centers.serves(centers):
@@ -313,8 +317,8 @@ class Core:
         outputs = self._process(event.source, state, items)
 
         # After the process was delayed, samples of other sources may still be in the kernel.
-        # A chunk therefore applies no deadlines. All other events apply them, such as a Tick, which
-        # follows after all available data were read.
+        # A chunk therefore applies no deadlines. All other events apply deadlines. One of them is
+        # the Tick, which follows after all available data were read.
         return outputs + self._advance(complete_only=True)
 
     def _process(
@@ -417,7 +421,8 @@ class Core:
             outputs += self._lags.step(now_ns)
 
         if self._session.collecting:
-            outputs += self._session.advance(now_ns)
+            exchanges = self._chain_tracker.exchanged_labels if self._chain_tracker else ()
+            outputs += self._session.advance(now_ns, exchanges)
         elif outputs and self._session.may_learn:
             fresh = self._collector.take_due(now_ns)
             outputs += [] if fresh is None else self._session.request_refit(fresh)

@@ -68,6 +68,12 @@ async def lose_and_exchange_markers(
     await listener.until(lambda: is_later_with_both(listener.latest["optical/chain"]))
     faulty = listener.latest["optical/chain"]
 
+    # The static phase rejects the exchanged labels.
+    await simulator.send_command("play stand")
+    status = await listener.phase("static", 3.0)
+    assert status["phase"] == "aborted"
+    assert "T1 and T3 look exchanged: T1 is at the place of T3" in status["text"]
+
     await simulator.send_command("show F2")
     await simulator.send_command("exchange T1 T3")
     await listener.until(lambda: not flags())

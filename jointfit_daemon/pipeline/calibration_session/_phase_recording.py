@@ -5,6 +5,7 @@ The calibration session decides when a phase starts, ends or is aborted.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.calibration.guidance import most_urgent
@@ -14,6 +15,8 @@ from jointfit_daemon.pipeline.events import CalibrationPhase
 from jointfit_daemon.units import NS_PER_S
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from jointfit_daemon.calibration import CalibrationTrial
     from jointfit_daemon.calibration.guidance import MovementGuide, MovementStatus
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
@@ -44,10 +47,10 @@ class PhaseRecording:
     start_ns : int
         Host time of the start.
     wanted_s : float
-        Required duration, s; for ``functional``, the longest duration.
-    guide : MovementGuide, optional
-        Guide of a functional phase.
-    min_s : float
+        Required duration of the phase, s; for ``functional``, the longest duration. guide :
+    MovementGuide, optional
+        Object that tracks which movements of a functional phase are complete, and instructs the
+    subject. min_s : float
         Shortest length of a functional phase, s.
     """
 
@@ -140,6 +143,15 @@ class PhaseRecording:
             return self._share(elapsed_s), f"all joints known; keep moving, {left_s:.0f} s", data
         return 1.0, f"all joints known after {elapsed_s:.0f} s", data
 
+    def label_problem(self, exchanged_labels: Sequence[str]) -> str | None:
+        """Return the reason to reject a static phase with exchanged labels; None without reason."""
+        if not exchanged_labels or self.phase != CalibrationPhase.STATIC:
+            return None
+        return (
+            f"static: {'; '.join(exchanged_labels)}. Correct the labels and repeat the phase; if "
+            "the labels are correct and the chain model is wrong, use force"
+        )
+
     @property
     def missing(self) -> tuple[str, ...]:
         """Movements that the subject must still perform, each with its instruction."""
@@ -160,3 +172,11 @@ class PhaseRecording:
         if self._gate is None:
             return self._recorder.trial()
         return self._recorder.trial(self._gate.still_since_ns, now_ns)
+
+
+def requested_seconds(value: object) -> float | None:
+    """Return a requested number of seconds; None if absent, NaN if it is not a number."""
+    if value is None:
+        return None
+    usable = isinstance(value, int | float) and not isinstance(value, bool)
+    return float(str(value)) if usable else math.nan

@@ -10,7 +10,6 @@ Invariant: the session never computes a fit itself, so it never blocks acquisiti
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +20,7 @@ from jointfit_daemon.pipeline.calibration_session._phase_recording import (
     INSTRUCTIONS,
     STATIC_TIMEOUT_S,
     PhaseRecording,
+    requested_seconds,
 )
 from jointfit_daemon.pipeline.calibration_session._state_machine import (
     COLLECTING,
@@ -104,7 +104,7 @@ class CalibrationSession:
         self.version = version
         """Version of the current calibration; None while it is not stored."""
         self._created_utc = "" if calibration is None else calibration.created_utc
-        """Date of the calibration with the number `version`."""
+        """Date of the calibration whose number is `version`."""
         self.lags: LagMonitor | None = None
         """Lags from the configuration, and lags estimated during operation."""
         self._state = self._resting_phase
@@ -119,7 +119,8 @@ class CalibrationSession:
         self.refits = OnlineRefits()
 
     def resume(self, before: CalibrationSession, *, same_rig: bool) -> None:
-        """Continue the session from before a reload; keep alignment and pose if `same_rig`."""
+        """Continue the session `before` a reload; keep its alignment and static pose if
+        `same_rig`."""
         self._jobs = before._jobs  # job numbers are never reused
         if same_rig:
             self._alignment, self._static = before._alignment, before._static
@@ -181,8 +182,12 @@ class CalibrationSession:
         if self._recording is not None:
             self._recording.add_mocap(t_ns, frame)
 
-    def advance(self, now_ns: int) -> list[Output]:
-        """Publish progress at most five times a second; end the phase when it is complete."""
+    def advance(self, now_ns: int, exchanged_labels: Sequence[str] = ()) -> list[Output]:
+        """Publish progress at most five times a second; end the phase when it is complete.
+
+        A complete static phase is rejected while labels of markers are exchanged. Each of
+        `exchanged_labels` is a sentence that names them.
+        """
         recording = self._recording
         if recording is None or not recording.progress_due(now_ns):
             return []
@@ -192,6 +197,10 @@ class CalibrationSession:
             CalibrationProgress(now_ns, recording.phase, round(done, 3), text, data)
         ]
         if done >= 1.0:
+            problem = None if self._force else recording.label_problem(exchanged_labels)
+            if problem is not None:
+                self._static = None
+                return outputs + self.abort(now_ns, problem)
             return outputs + self._start_fit(recording, now_ns)
         if recording.timed_out(now_ns):
             reason = (
@@ -236,7 +245,7 @@ class CalibrationSession:
             outputs = self.abort(request.t_ns, "abort requested")
             return [*outputs, request.reply("ok", {"phase": self.phase})]
 
-        wanted_s = _seconds(request.arguments.get("seconds"))
+        wanted_s = requested_seconds(request.arguments.get("seconds"))
         key, message = "phase", PLANAR if self._chain.planar else self._refusal(wanted)
         if message is None and wanted_s is not None and not 0.0 < wanted_s <= MAX_PHASE_S:
             key, message = "seconds", f"expected a number above 0 and up to {MAX_PHASE_S}"
@@ -505,14 +514,6 @@ class CalibrationSession:
         self._change(SessionEvent.FAILED)
         self._recording = self._fit = None
         return [*outputs, self.status(t_ns, reason, CalibrationPhase.ABORTED)]
-
-
-def _seconds(value: object) -> float | None:
-    """Return a requested number of seconds; None if absent, NaN if it is not a number."""
-    if value is None:
-        return None
-    usable = isinstance(value, int | float) and not isinstance(value, bool)
-    return float(str(value)) if usable else math.nan
 
 
 def _notices(

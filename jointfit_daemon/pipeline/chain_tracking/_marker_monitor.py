@@ -120,6 +120,16 @@ class MarkerMonitor:
         misfit = [MarkerFlag.MISFIT.value] if self.misfit else []
         return (*misfit, *self._faults, *lost)
 
+    def exchanged_labels(self) -> list[str]:
+        """Return a sentence for each current exchange of labels, without a full stop."""
+        return [self._exchange_text(m) for m in self._faults.values() if len(m) > 1]
+
+    def _exchange_text(self, markers: tuple[int, ...], distances: str = "") -> str:
+        names = [self.model.markers[m].name for m in markers]
+        following = zip(names, names[1:] + names[:1], strict=True)
+        order = join_words(f"{name} is at the place of {other}" for name, other in following)
+        return f"{join_words(names)} look exchanged{distances}: {order}"
+
     def _hidden_since(self, seen_ns: int | None, t_ns: int) -> int:
         if seen_ns is not None:
             return seen_ns
@@ -258,12 +268,8 @@ class MarkerMonitor:
         names = [self.model.markers[m].name for m in markers]
         shown = join_words(f"{1000 * distances[m]:.0f} mm" for m in markers)
         if len(markers) > 1:
-            following = zip(names, names[1:] + names[:1], strict=True)
-            order = join_words(f"{name} is at the place of {other}" for name, other in following)
-            text = (
-                f"{join_words(names)} look exchanged ({shown} from their places in the model): "
-                f"{order}. Correct their labels; they are excluded until then"
-            )
+            exchange = self._exchange_text(markers, f" ({shown} from their places in the model)")
+            text = f"{exchange}. Correct their labels; inverse kinematics excludes them until then"
             return MarkerReport(names[0], MarkerFlag.EXCHANGED, text, {"markers": names})
         segment = self.model.markers[markers[0]].segment
         text = (

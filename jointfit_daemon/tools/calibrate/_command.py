@@ -106,7 +106,11 @@ _Seconds = Annotated[
 ]
 _Force = Annotated[
     bool,
-    typer.Option("--force", help="Accept a calibration that is worse than the stored calibration."),
+    typer.Option(
+        "--force",
+        help="Accept a calibration that is worse than the stored calibration, and a static pose "
+        "whose marker labels do not match the chain model.",
+    ),
 ]
 
 
@@ -222,7 +226,8 @@ async def _guide_phases(
                     if seconds is not None:
                         arguments["seconds"] = seconds
                     async with _track_progress(client, console) as tracker:
-                        # Each subscription delivers the retained status, which precedes the result.
+                        # Each subscription delivers the retained status. Wait for it, so that it
+                        # cannot be mistaken for the result of the phase.
                         await client.subscribe(*TOPICS)
                         await tracker.wait_for_retained()
                         status = await _run_phase(client, tracker, arguments, config)
@@ -264,8 +269,8 @@ async def _await_answer(
     Raises
     ------
     NoAnswerError
-        No answer arrived, and no status of a requested phase. In the case of a phase, an abort
-        request was sent, because the daemon may still receive the first request.
+        No answer arrived, and no status shows that the requested phase has begun. In the case of a
+        phase, an abort request was sent, because the daemon may still receive the first request.
     """
     from jointfit_daemon.outputs.mqtt import BrokerLostError, NoAnswerError
 

@@ -71,6 +71,7 @@ def feed(
     *,
     sensors: tuple[str, ...] = SENSORS,
     cameras: bool = True,
+    exchanged_labels: tuple[str, ...] = (),
 ) -> list[Output]:
     """Send samples at 50 Hz of sensors that turn at `speed` rad/s, and mocap frames."""
     out: list[Output] = []
@@ -80,7 +81,7 @@ def feed(
             out += one.add_sample(sensor, t_ns, turned(speed * k / 50))
         if cameras:
             one.add_mocap(t_ns, seen(t_ns))
-        out += one.advance(t_ns)
+        out += one.advance(t_ns, exchanged_labels)
     return out
 
 
@@ -146,6 +147,20 @@ def test_static_phase_without_stillness_is_aborted_with_the_reason() -> None:
     statuses = only(feed(one, 0, 125, speed=0.5), CalibrationStatus)
     assert statuses[-1].phase == "aborted"
     assert "moving" in statuses[-1].text
+
+
+def test_static_phase_is_rejected_while_labels_are_exchanged_unless_forced() -> None:
+    one = posed()
+    assert one.status(0, "").done == ("static",)
+    for force in (False, True):
+        ask(one, 20 * SECOND, "static", force=force)
+        outputs = feed(one, 20, 30, exchanged_labels=("T1 and T2 look exchanged",))
+        assert len(only(outputs, FitJob)) == force
+        if not force:
+            (status,) = only(outputs, CalibrationStatus)
+            assert status.phase == "aborted"
+            assert "T1 and T2 look exchanged. Correct the labels" in status.text
+            assert status.done == ()
 
 
 def test_progress_is_published_at_most_five_times_a_second() -> None:
@@ -270,7 +285,7 @@ def test_static_fit_uses_the_requested_length() -> None:
 
 
 def test_functional_fit_uses_the_requested_length_of_the_pose() -> None:
-    """The fit must not refuse an accepted pose later."""
+    """The fit must not refuse a pose that the static phase accepted."""
     one = session()
     ask(one, 0, "static", seconds=1.5)
     (job,) = only(feed(one, 0, 5), FitJob)
