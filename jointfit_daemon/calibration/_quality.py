@@ -162,7 +162,10 @@ class CenterCoordinates:
 
 @dataclass(frozen=True, slots=True)
 class CenterQuality:
-    """Center of rotation of one joint from the movement, without the prior of the static pose."""
+    """Center of rotation of one joint from the movement alone.
+
+    The prior that the subject stood upright in the static pose is not applied.
+    """
 
     method: str
     frames: int

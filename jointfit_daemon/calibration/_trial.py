@@ -87,8 +87,9 @@ class CalibrationSettings:
 
     method: Method = "anchored"
     procedure: Procedure = "corrected"
-    """Procedure of the calibration. ``patent`` uses the component mean in the static pose, markers
-    without refinement, and the regression that was verified on the held-out part.
+    """Procedure of the calibration. ``patent`` uses the mean of the quaternion components in the
+    static pose, markers without refinement, and the regression that was verified on the held-out
+    part of the trial.
     """
     static_s: float = 5.0
     align_s: float = 30.0

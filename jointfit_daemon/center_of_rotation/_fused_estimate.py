@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 
 TOLERATED = 2.5
-"""Threshold κ of the Huber weight. The weight of an estimate is reduced if its Mahalanobis
-distance, divided by the square root of the dimension, exceeds the threshold.
+"""Threshold κ of the Huber weight. The weight of an estimate is reduced if the distance D_k of
+`fuse_centers` exceeds this threshold.
 """
 _PASSES = 50
 
@@ -34,7 +34,8 @@ def fuse_centers(estimates: Sequence[CenterEstimate], *, robust: bool = True) ->
     .. math:: I_k = C_k^{-1}, \qquad C = \Big(\sum_k w_k I_k\Big)^{-1}, \qquad
               c = C \sum_k w_k I_k c_k
 
-    where :math:`C_k` is the covariance of estimate k and w_k = min(1, κ/D_k)². κ is `TOLERATED`.
+    where :math:`c_k` is the center of estimate k, :math:`C_k` its covariance, and
+    w_k = min(1, κ/D_k)² its weight. κ is `TOLERATED`.
     D_k is the Mahalanobis distance of estimate k from the center fused from the other estimates,
     divided by the square root of the dimension. The information :math:`I_k` is zero along
     unobserved directions. If the squared differences between the estimates are larger than their

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 _FEWEST = 4
-"""Smallest number of marker positions for two slopes and a variance."""
+"""Smallest number of marker positions from which two slopes and a variance can be estimated."""
 
 
 def hinge_axis_sd(points: Array, axis: Array | None) -> float | None:

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.center_of_rotation._result import CenterEstimate
 
 _LEAST_VARIANCE_M2 = 1e-12
-"""Smallest variance of the joint position from one side, m². It limits the weight of a side without
-noise.
+"""Lower limit of the variance of a joint position that is computed from one segment, m². Without
+this limit, a segment without noise would have an infinite weight.
 """
 
 

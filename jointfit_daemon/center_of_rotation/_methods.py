@@ -125,7 +125,7 @@ def _automatic(movement: Movement) -> str:
 
 
 def _beyond_parent(found: CenterEstimate, parent: Array | None) -> CenterEstimate:
-    """Return the estimate, refused if noise of the parent's frame may be its only rotation."""
+    """Refuse an estimate if noise of the parent's markers alone may explain its rotation."""
     if parent is None or found.refused is not None or len(found.center) < 3:
         return found
     turn = sqrt(NOISE_FACTOR) * turn_noise(parent, found.noise)
@@ -227,5 +227,7 @@ _ALL = (
     ),
 )
 METHODS: dict[str, EstimationMethod] = {method.name: method for method in _ALL}
-"""``kasa pratt taubin hyper geometric running_circle oriented grid three_frames`` (plane),
-``gamage_lasenby halvorsen sphere running_sphere score sara`` (space), by name."""
+"""Estimators by name. The circle methods are ``kasa pratt taubin hyper geometric running_circle
+oriented grid three_frames``. The methods in space are ``gamage_lasenby halvorsen sphere
+running_sphere score sara``, of which ``running_sphere`` also accepts points in a plane.
+"""

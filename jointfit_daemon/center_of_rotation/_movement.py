@@ -65,7 +65,7 @@ class Movement:
     """
     residuals: Array | None = None
     """Residual that the optical system reports for each of `points`, m, shape (n, k); NaN where
-    unknown. Only ratios of residuals are used. A frame with a larger residual counts as noisier.
+    unknown. The noise of a position is assumed to be proportional to its residual.
     """
     angles: Array | None = None
     """Angle of the child about the joint's axis relative to the parent, rad, shape (n,). It is

@@ -73,7 +73,10 @@ def fit_oriented(p: Array, movement: Movement) -> CenterEstimate:
 
 
 def grid(p: Array, _: Movement) -> CenterEstimate:
-    """Return the best node of a grid around the circle fit of one marker, as a baseline method."""
+    """Return the best node of a grid around the circle fit of one marker.
+
+    The other planar methods are compared to this method.
+    """
     about = replace(circle_estimate(p, limits=LIMITS), method="grid")
     if about.refused is not None:
         return about
@@ -155,7 +158,7 @@ def fit_in_plane(name: str, fit: MarkerFit, movement: Movement, points: Array) -
     if found.refused is not None and len(found.unseen):
         return replace(refusal(found.method, 3, found.frames, found.refused), flags=found.flags)
 
-    # a center in the plane is a line in space, whose direction is unobserved
+    # a center in the plane is a line in space, and the position along this line is unobserved
     across = np.cross(plane[:, 0], plane[:, 1])
     stay = np.nanmean(points, axis=(0, 1)) if movement.near is None else movement.near
     return replace(

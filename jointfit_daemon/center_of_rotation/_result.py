@@ -23,7 +23,8 @@ class CenterEstimate:
     """Estimate of the point that is fixed in both the parent and the child segment.
 
     All estimators return this type. A `JointCenter` of the calibration contains a `CenterEstimate`,
-    and combines it with the prior and with the other joints of the chain.
+    and combines it with the other joints of the chain and with the prior that the subject stood
+    upright in the static pose.
     """
 
     method: str
@@ -54,7 +55,9 @@ class CenterEstimate:
     """
     frames: int
     effective_frames: float
-    """Effective number of frames, which forgetting and the correlation between frames reduce."""
+    """Effective number of frames. It is smaller than `frames` if successive residuals are
+    correlated, or if old frames have smaller weights than new frames.
+    """
     unseen: Array = field(default_factory=lambda: np.zeros((0, 3)))
     """Unit vectors of the unobserved directions, shape (u, d)."""
     axis: Array | None = None

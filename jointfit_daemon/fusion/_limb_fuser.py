@@ -75,7 +75,9 @@ class LimbFuser:
         self._chain, self._drifting = chain, drifting
         self.sensor_monitor = sensor_monitor or SensorMonitor(chain)
         self.worn = True
-        """Whether the sensors are on the body; on the calibration plate no pairs are compared."""
+        """Whether the sensors are on the body. On the calibration plate, the sensors of a segment
+        are not compared.
+        """
         usable = calibration is not None and calibration.fits(chain)
         self._uncorrected = calibration is not None and calibration.procedure == "patent"
         """Whether sensors are used without correction, even if they have faults."""

@@ -39,7 +39,9 @@ class OpticalReading(NamedTuple):
     parts. If only one part is visible, the center fixed in this part is used alone.
     """
     gaps: list[float | None]
-    """Distance between these two centers at each joint, m."""
+    """Distance between the two centers of each joint, which are fixed in the two adjacent body
+    parts, m.
+    """
     joints: list[JointReading | None]
     """Angles of the joints between two segments; None at the ends of the chain."""
 

@@ -54,9 +54,11 @@ FADE_NS = 250_000_000
 MODEL_FADE_NS = 1_000_000_000
 """Fade time after a change of the models by online learning, ns."""
 OUTLIER = radians(3.0)
-"""Largest distance, rad, between the difference of two sets of sensors in the last frame and the
-median of this difference in the last frames. With a larger distance the last frame counts as wrong.
-Soft-tissue artefact reaches a third of this threshold."""
+"""Limit for the last frame before a sensor was lost, rad. The rotation from the prediction of the
+remaining sensors to the output is computed in each of the last five frames. If the rotation in the
+last frame differs from the median by more than this limit, the last frame counts as wrong.
+Soft-tissue artefact causes at most a third of this difference.
+"""
 _HISTORY = 5
 """Number of stored frames. The median of five frames is correct even if two frames are wrong."""
 HOLD_NS = 200_000_000
@@ -94,7 +96,9 @@ class _Blend(NamedTuple):
 
     start_ns: int
     alive: Names
+    """Sensors of the segment in this set."""
     near: Names
+    """Sensors of the neighboring segment in this set."""
 
 
 class SegmentFuser:

@@ -30,8 +30,9 @@ def sensor_states(
               q_j = q_\mathrm{proximal}^* \otimes q_\mathrm{distal}
 
     where q_so is the orientation of the segment from one sensor, q_s the orientation of this
-    sensor, q_W the rotation of its world, q_bias the sensor-to-segment alignment, and q_j the
-    rotation of a joint. Source: patent CN 114533039 B, steps S3 and S7.
+    sensor, q_W the rotation from the world of the sensor to the optical world, q_bias the
+    sensor-to-segment alignment, and q_j the rotation of a joint. Source: patent CN 114533039 B,
+    steps S3 and S7.
 
     Parameters
     ----------

@@ -1,14 +1,15 @@
 r"""Values and standard deviations of named joint coordinates, such as ``hip_flexion_r``.
 
-The state of a chain consists of rotation matrices. The coordinates q of a joint parametrize its
-rotation matrix A by a function f(q). This module inverts f by Gauss-Newton steps on the manifold,
+The state of a chain contains a rotation matrix A for each joint. The coordinates q of the joint
+determine this matrix by a function, A = f(q). This module inverts f by Gauss-Newton steps on the
+manifold,
 
 .. math:: q \leftarrow q + G^{+}\,\log(f(q)^{-1} A), \qquad G = \partial\log / \partial q
 
 :math:`G^{+}` is the pseudo-inverse of G. The covariance of the coordinates is
-:math:`G^{+} C G^{+T}`, where C is the covariance of the joint in a step of the chain
-state (`chains.apply_step`). A step contains the rotation vector by which A is rotated, in the axes
-of the segment, and the translation of a free joint.
+:math:`G^{+} C G^{+T}`, where C is the covariance of a step of this joint. A step of the chain
+state (`chains.apply_step`) contains, for each joint, the rotation vector by which A is rotated, in
+the axes of the segment, and the translation of a free joint.
 """
 
 from __future__ import annotations

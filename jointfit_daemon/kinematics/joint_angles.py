@@ -29,7 +29,9 @@ if TYPE_CHECKING:
 GIMBAL_SINE = 0.9999
 """Sine of the middle angle above which the two outer angles are not separated."""
 LOCKED_SINE = sqrt(1.0 - GIMBAL_SINE**2)
-"""Sine of the elevation (0.8°) below which plane and axial rotation are not separated."""
+"""Sine of the elevation (0.8°) below which the plane of elevation and the axial rotation are not
+separated.
+"""
 _SMALL_TILT = 1e-6
 """Sine of half the tilt below which the tilt is computed as twice this sine."""
 

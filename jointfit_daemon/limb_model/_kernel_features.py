@@ -46,11 +46,11 @@ def relative_rotations(sensors: Sequence[Array], mean: Array, q_other: Array) ->
     Parameters
     ----------
     sensors : sequence of ndarray, shape (n, 4)
-        Bone-aligned sensors of the segment.
+        Orientation of the segment computed from each of its sensors.
     mean : ndarray, shape (n, 4)
         Mean of the sensors.
     q_other : ndarray, shape (n, 4)
-        Bone-aligned orientation of the neighboring segment.
+        Orientation of the neighboring segment.
     """
     inverse = rotation.conjugate(sensors[0])
     k = rotation.log(rotation.multiply(rotation.conjugate(mean), q_other))

@@ -3,20 +3,23 @@ r"""Recommended model: mean of the sensors with a posture-dependent soft-tissue 
 .. math:: \hat q = \bar q \otimes \exp\bigl((1 - w) [\eta_a c_a + (1 - \eta_a) T_a]
           + w [\eta_b c_b + (1 - \eta_b) T_b]\bigr)
 
-:math:`\bar q` is the mean of the sensors of the segment. The corrections :math:`c_a` and
-:math:`c_b` are two fits (`KernelExpert`) of :math:`\rho = \log(\bar q^* \otimes q_{ref})`. Expert a
-uses only relative rotations and generalizes to other movements. Expert b also uses the tilt of the
-segment and has smaller errors on the trained movements. The weight w of expert b is 1 in the middle
-of the training range, decreases towards its limit, and is 1/2 outside. Outside, the factors
-:math:`\eta` decrease, and the linear trend T of `_kernel_trend`, which extrapolates best, replaces
-the experts. The factor of b decreases from the limit of the training range on, the factor of a from
-a larger distance on. The trend has no component about the long axis. About this axis the correction
-of a replaces the correction of b, and zero replaces the correction of a.
+:math:`\bar q` is the mean of the sensors of the segment, and :math:`q_{ref}` is the optical
+reference of the training. The corrections :math:`c_a` and :math:`c_b` are two fits (`KernelExpert`)
+of :math:`\rho = \log(\bar q^* \otimes q_{ref})`. Expert a uses only relative rotations and
+generalizes to other movements. Expert b also uses the tilt of the segment and has smaller errors on
+the trained movements. The weight w of expert b is 1 in the middle of the training range, decreases
+towards the limit of this range, and is 1/2 outside.
+
+Outside the training range, the factors :math:`\eta` decrease, and the linear trend T of
+`_kernel_trend` replaces the experts, because the trend extrapolates best. The factor of expert b
+decreases from the limit of the training range on, the factor of expert a from a larger distance on.
+:math:`T_a` and :math:`T_b` are equal to T about x and y. T has no component about the long axis z.
+About z, :math:`T_a` is zero, and :math:`T_b` is :math:`\eta_a c_a`, the correction of expert a.
 
 Invariants: the correction is zero if the segment is upright, the joint is straight and the sensors
 agree. A rotation of the world about the vertical does not change the correction.
 
-The claimed standard deviations of the axes are estimated on held-out frames. They increase with the
+The standard deviations about the axes are estimated on held-out frames. They increase with the
 larger leverage ratio of the two experts.
 """
 
@@ -136,8 +139,8 @@ class KernelModel(SegmentModel):
         p = (1.0 - weight) * inside
         rest = 1.0 - p - s
 
-        # There is no trend about z. The correction of a replaces the correction of b, and zero
-        # replaces the correction of a.
+        # There is no trend about z. Outside the training range, the correction of expert a replaces
+        # the correction of expert b, and zero replaces the correction of expert a.
         (ax, ay, az), (bx, by, bz) = a, b
         c = (
             p * ax + s * bx + rest * tx,

@@ -2,11 +2,12 @@ r"""Linear trend of the soft-tissue artefact, used outside the training range.
 
 .. math:: T_j = c_j + \sum_i \beta_{ij} d_{ij} + \gamma_j v_{o(j)}, \qquad T_z = 0
 
-for the axes j = x, y, which are horizontal in the static pose. The terms are a constant, the
-disagreement d of each further sensor about the same axis, and the tilt v about the same axis. The
-term with d is equivalent to other weights of the sensors in the mean. About z, the long axis of the
-segment, a constant correction and a heading error are indistinguishable, so there is no trend. The
-trend does not depend on headings.
+for the axes j = x, y, which are horizontal in the static pose. c, β and γ are coefficients.
+:math:`d_{ij}` is the rotation about axis j from the first sensor to the further sensor i. v is the
+tilt, and :math:`v_{o(j)}` is its component that a rotation about axis j changes, with o(x) = y and
+o(y) = x. The term with d is equivalent to other weights of the sensors in the mean. About z, the
+long axis of the segment, a constant correction and a heading error are indistinguishable, so there
+is no trend. The trend does not depend on headings.
 """
 
 from __future__ import annotations

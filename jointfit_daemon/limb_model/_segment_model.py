@@ -26,11 +26,13 @@ if TYPE_CHECKING:
 
 
 FEW_MOVEMENTS = 3
-"""Smallest number of training movements with which the claimed standard deviation is not increased.
+"""Smallest number of training movements with which the standard deviation of a prediction is not
+increased.
 """
 FEW_MOVEMENTS_FACTOR = 2.5
-"""Factor of the standard deviation with fewer training movements. In measurements, errors on an
-untrained movement were 2.2 to 2.7 times as large as on trained movements.
+"""Factor by which the standard deviation is increased with fewer training movements. In
+measurements, errors on an untrained movement were 2.2 to 2.7 times as large as on trained
+movements.
 """
 
 

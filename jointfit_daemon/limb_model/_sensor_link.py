@@ -34,7 +34,9 @@ if TYPE_CHECKING:
 LinkKind = Literal["pair", "joint"]
 
 LEAST_LEVEL = 0.5
-"""Smallest squared horizontal component of a flexion axis with which its heading is defined."""
+"""Smallest squared length of the horizontal part of a flexion axis, a unit vector, with which the
+axis has a heading.
+"""
 
 
 @dataclass(frozen=True, slots=True)

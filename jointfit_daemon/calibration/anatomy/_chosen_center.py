@@ -45,8 +45,8 @@ class CenterChoice:
     methods: Mapping[str, CenterMethod] = field(default_factory=dict)
     """Estimator by joint; joints that are absent use ``sphere``."""
     turned: Mapping[str, Array] = field(default_factory=dict)
-    """Rotation q_now_static of each segment from its IMUs, at the m instants of the tracks, shape
-    (m, 4); NaN where unknown."""
+    """Rotation of each segment since the static pose, q_now_static, computed from its IMUs at the m
+    instants of the tracks, shape (m, 4); NaN where unknown."""
 
 
 def chosen_center(

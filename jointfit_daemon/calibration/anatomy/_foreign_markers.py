@@ -1,8 +1,8 @@
 """Search for markers that do not move with their body part during a movement.
 
-If a label or a list of markers in rig.toml is wrong since the static pose, the markers agree with
-the static pose, but one marker of a body part is on another body part. The movement shows it. Two
-measures are compared with the range of soft-tissue artefact:
+If a label or a list of markers in rig.toml was already wrong in the static pose, the markers agree
+with the static pose, but one marker of a body part is on another body part. The movement shows this
+fault. Two measures are compared with the range of soft-tissue artefact:
 
 - the change of the distance of two markers of the part, and
 - the movement of a marker in the frame of the other markers. A marker near the joint of two parts
@@ -45,8 +45,8 @@ _ELSEWHERE = 0.5
 """Largest movement in the frame of another part, relative to the movement in the own part, with
 which a marker counts as a marker of the other part."""
 _SIMILAR = 2.0
-"""Largest movement in the frame of a part, relative to the part with the smallest movement, with
-which the part is named too."""
+"""Largest ratio of the movement in the frame of a part to the smallest movement in the frame of any
+part. Up to this ratio, the marker may be on the part, and the report names the part too."""
 _SAMPLED = 1500
 """Largest number of frames that are examined."""
 _FEWEST = 100
@@ -170,7 +170,7 @@ def _report(parts: Mapping[str, _PartMarkers], name: str, marker: str) -> Foreig
         if there is not None and _upper_quartile(there) < most:
             near[other] = _upper_quartile(there)
 
-    # A foot moves little relative to its shank, so that both may be similar.
+    # A foot moves little relative to its shank, so the movements in both frames may be similar.
     elsewhere = tuple(o for o in near if near[o] <= _SIMILAR * min(near.values()))
     rms = float(np.sqrt(np.nanmean(movement**2)))
     return ForeignMarker(marker, name, own.markers, rms, elsewhere)

@@ -56,7 +56,7 @@ class ClusterTrack:
     t_ns: NDArray[np.int64]
     """Time stamps, ns, shape (m,)."""
     q: Array
-    """Rotation q_now_static, shape (m, 4); NaN without a pose."""
+    """Rotation since the static pose, q_now_static, shape (m, 4); NaN without a pose."""
     p: Array
     """Current position of the cluster origin, optical world, m, shape (m, 3)."""
     points: Array

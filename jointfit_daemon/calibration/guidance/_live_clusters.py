@@ -88,7 +88,9 @@ class LiveClusters:
         number of markers of a part; NaN if not visible, or if the markers of the part do not fit
         the static pose."""
         self.R = np.tile(np.eye(3), (shape[0], 1, 1))
-        """R_now_static of the last frame, shape (parts, 3, 3); valid only where `placed`."""
+        """Rotation of each part since the static pose, R_now_static, in the last frame, shape
+        (parts, 3, 3); valid only where `placed`.
+        """
         self.p = np.zeros((shape[0], 3))
         """Position of the origin of each part, m, shape (parts, 3)."""
         self.placed = np.zeros(shape[0], dtype=np.bool_)

@@ -3,16 +3,16 @@ r"""Joint centers during the movement, frame by frame, with their expected error
 Two errors are reported separately. *Noise* decreases with the number of frames. It is the
 covariance of the fit, increased for the correlation of the residuals in time. The error from
 *soft-tissue artefact* depends on posture, so more frames do not reduce it. It decreases with a
-larger arc, as the leverage in brackets shows:
+larger arc, because a larger arc increases the matrix in brackets:
 
 .. math:: \mathrm{Cov}_{skin} = \sigma_r^2 \Big[ \frac{1}{\sum_j n_j} \sum_j n_j
           \frac{\mathrm{Cov}(v_j)}{R_j^2} \Big]^{-1} + \sigma_s^2 I
 
 where :math:`v_j` is marker j in coordinates of the proximal part, :math:`R_j` its distance from the
-center, and :math:`n_j` its number of frames. :math:`\sigma_r, \sigma_s` are the standard deviations
-of the soft-tissue artefact in `calibration.anatomy`. The final fit uses the same values and
-therefore predicts the same soft-tissue error. It has a smaller random error, because it compares
-the poses of both body parts instead of fitting spheres.
+center, and :math:`n_j` its number of frames. :math:`\sigma_r` is `RADIAL_ARTEFACT_SD_M` and
+:math:`\sigma_s` is `SKIN_SD_M` of `calibration.anatomy`. The fit after the movement uses the same
+values and therefore predicts the same soft-tissue error. This fit has a smaller random error,
+because it compares the poses of both body parts instead of fitting spheres.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 r"""Fit of an ellipsoid to measurements of a vector of constant magnitude.
 
-A sensor with bias b and a symmetric matrix M of scale factors and non-orthogonality measures v:
+Let b be the bias of a sensor, and M the matrix of inverse scale factors and non-orthogonality. A
+measurement v of a vector with the magnitude r satisfies
 
 .. math:: |M (v - b)| = r
 

@@ -67,7 +67,9 @@ range of all readings (mean over the three axes). Readings at rest contain no ad
 information.
 """
 _SATURATED_SHARE = 0.03
-"""Fraction of readings with exactly the largest or smallest value that indicates saturation."""
+"""Fraction of the readings with exactly the largest or smallest value, above which the readings
+count as saturated.
+"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,7 +28,7 @@ _RANK = 1e-8
 
 
 class Anderson:
-    """The last iterates p and their images g(p)."""
+    """Proposes the next point of the iteration from the last points p and their images g(p)."""
 
     def __init__(self) -> None:
         self._images: list[Array] = []

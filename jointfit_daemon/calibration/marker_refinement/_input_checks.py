@@ -66,7 +66,8 @@ def check(
     ------
     RefinementError
         A fault prevents the refinement; the message lists the faults of all trials. Trials with
-        the same name are parts of one movement and have one fault.
+        the same name are parts of one movement. A fault of their marker names, unit or size is
+        listed once.
     """
     every = [*trials, *validation]
     by_name: dict[str, list[str]] = {}

@@ -190,8 +190,8 @@ def _task(
     first = solve_frames(model, targets, weights, options=options)
     first, improved = restart_local_minima(model, targets, weights, first, options)
     if settings.cost == "l1":
-        # The l1 loss of a typical error is smaller than its l2 loss. The prior is scaled by the
-        # same factor.
+        # The weight of a typical error is smaller with the l1 loss than with the l2 loss, by the
+        # factor L1_CORNER_M / error. The prior is scaled by the same factor.
         typical = float(np.nanmedian(np.linalg.norm(first.residuals, axis=-1)))
         weaker = min(1.0, L1_CORNER_M / max(typical, L1_CORNER_M))
         problem = replace(problem, huber_m=L1_CORNER_M, prior=weaker * settings.prior)

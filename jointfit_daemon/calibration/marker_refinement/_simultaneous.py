@@ -1,7 +1,8 @@
 r"""Bundle adjustment of markers and poses: Gauss-Newton with Schur elimination of the poses.
 
-Frames are coupled only through the markers, so the normal equations have one small block for each
-frame. With errors in segment axes and :math:`J_{tm} = \partial e/\partial q`,
+The module `_objective` defines the objective F and the error e of marker m in frame t. Frames are
+coupled only through the markers, so the normal equations have one small block for each frame. With
+errors in segment axes and :math:`J_{tm} = \partial e/\partial q`,
 
 .. math::
 
@@ -11,7 +12,8 @@ frame. With errors in segment axes and :math:`J_{tm} = \partial e/\partial q`,
     \delta q_t = -A_t^{-1} (g_t + B_t\, \delta p)
 
 where p are the marker positions, q the poses, g and h the gradients of F with respect to q and p,
-and C is the marker block of the normal matrix. All terms include the weights. A step is accepted
+and C is the marker block of the normal matrix. :math:`B_t` consists of the blocks :math:`B_{tm}` of
+all markers. All terms include the weights. A step is accepted
 only if F decreases. Source: the elimination is the variable projection of Golub and Pereyra, SIAM
 J. Numer. Anal. 10 (1973), 413, in the form that is used in bundle adjustment.
 """

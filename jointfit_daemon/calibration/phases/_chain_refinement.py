@@ -2,8 +2,9 @@
 
 Positions are refined on the first part of the movement and evaluated on the rest. A segment uses
 the refined positions only if they reduce the error of its markers on the rest. If they do not
-reduce the error of the whole model, all segments use the positions of the model. If the model does
-not fit the movement, the fault is reported, and the calibration continues without a refinement.
+reduce the error of the whole model, all segments use the nominal positions of the model. If the
+model does not fit the movement, the fault is reported, and the calibration continues without a
+refinement.
 """
 
 from __future__ import annotations

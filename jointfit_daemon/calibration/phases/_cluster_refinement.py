@@ -9,8 +9,8 @@ refined shape :math:`p'` is therefore fitted to the marker positions :math:`p` o
 .. math:: \min_{R,t} \sum_k \rho(|R p'_k + t - p_k|)
 
 with the Huber loss :math:`\rho`, so that a single displaced marker does not rotate its part. The
-refinement uses the first section of the trial and is evaluated on the rest. Body parts whose error
-on the rest is not smaller are unchanged.
+refinement uses the first section of the trial and is evaluated on the rest. A body part is
+unchanged if the refinement does not reduce its error on the rest.
 """
 
 from __future__ import annotations

@@ -239,8 +239,9 @@ def _label_faults(
     track: OpticalTrack, clusters: Mapping[str, MarkerCluster]
 ) -> tuple[list[str], set[str]]:
     """Return the reasons to refuse a movement because of its labels, and their body parts."""
-    # Labels that were exchanged since the static pose also move with another part. If another
-    # marker of the part moves, its cluster is wrong, and so are exchanges that are found with it.
+    # A marker whose label was exchanged after the static pose also moves with another part, so both
+    # searches report it. If `foreign_markers` reports a further marker of a part, the cluster of
+    # this part is wrong, and the exchanges that were found with this cluster are not reliable.
     foreign = foreign_markers(track, clusters)
     exchanges = [
         exchange

@@ -50,7 +50,8 @@ if TYPE_CHECKING:
 
 
 COMPARED: tuple[Method, ...] = tuple(method for method in METHODS if method != "single")
-"""Methods that are evaluated. ``single`` is omitted, because each sensor is evaluated alone, too.
+"""Methods that are evaluated. ``single`` is omitted, because `evaluate` also evaluates each sensor
+alone.
 """
 MAX_TRAINING_FRAMES = 2000
 """Largest number of training frames of one trial; longer trials are decimated."""

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 
 HEADING_SEPARABLE = 0.98
-"""Ratio of singular values above which the data do not distinguish heading and sensor-to-segment
-alignment.
+"""Value of `SensorAlignment.kappa` above which the data do not distinguish the heading of the
+sensor's world from the sensor-to-segment alignment.
 """
 FAR = np.deg2rad(45.0)
 """Median angle between an aligned sensor and its reference above which soft tissue is not the

@@ -81,7 +81,7 @@ SHIFTED = np.deg2rad(5.0)
 orientations from the cameras, rad. A displaced marker cluster causes a larger rotation.
 """
 TURN_FRAMES = 150
-"""Number of frames over which heading drift is assumed to be constant: 15 s."""
+"""Number of frames over which heading drift is assumed to be constant: 15 s at 10 Hz."""
 
 
 def refit_models(

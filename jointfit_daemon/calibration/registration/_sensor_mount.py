@@ -57,8 +57,9 @@ class SensorAlignment:
     q_mount: Array
     """Sensor-to-segment alignment q_sensor_body, shape (4,)."""
     kappa: float
-    """Ratio of the second to the first singular value; 0 for kind ``mount``. At 1 the rotation of
-    the world and the sensor-to-segment alignment cannot be distinguished.
+    """Ratio of the second to the first singular value of the matrix M in `fit_sensor_alignment`; 0
+    for kind ``mount``. At 1 the rotation of the world and the sensor-to-segment alignment cannot be
+    distinguished.
     """
     weak_error: float
     """Standard error in the least observable direction, rad; inf if the direction is unobservable.

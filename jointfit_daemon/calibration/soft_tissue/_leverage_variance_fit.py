@@ -1,4 +1,4 @@
-"""Fit of the claimed variance as a function of the distance from the training range."""
+"""Fit of the variance of a correction as a function of the distance from the training range."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
 
 FAR = 1.5
-"""Leverage ratio of a prior observation of the variance. The observation is needed, because
-training contains few frames far outside the training range.
+"""Leverage ratio of one assumed error, which is added to the errors of the held-out frames. The
+assumption is needed, because training contains few frames far outside the training range.
 """
 FAR_FACTOR = 3.0
-"""Error of the prior observation relative to the RMS error."""
+"""Ratio of the assumed error to the RMS error of the held-out frames."""
 FAR_SHARE = 0.3
-"""Weight of the prior observation relative to the sum of all frames."""
+"""Ratio of the weight of the assumed error to the sum of the weights of all frames."""
 
 LEAST = 0.15
 """Lower bound of the coefficients a and b of `LeverageVariance`, as a fraction of the mean square
@@ -65,7 +65,7 @@ def measure_spread(
     """Fit the variance as a function of the leverage ratio over all held-out frames.
 
     Every grouping contributes to the fit. Blocks of a trial are close to the rest of the trial;
-    whole trials are far from other trials. A prior observation (`FAR`, `FAR_FACTOR`) represents
+    whole trials are far from other trials. An assumed error (`FAR`, `FAR_FACTOR`) represents
     movements that no trial contains.
 
     Parameters

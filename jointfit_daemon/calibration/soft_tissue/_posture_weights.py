@@ -8,8 +8,8 @@ i decreases with the density p of the training frames about its posture:
           p_i = \frac1m \sum_{k=1}^{m} e^{-|f_i - f_k|^2 / (2 b^2)} + \frac{1}{2m}
 
 The posture f consists of the joint rotation and the tilt of the segment. The sum contains m frames
-at equal intervals. With the exponent 0 every frame would have the same influence, with -1 every
-posture.
+at equal intervals. With the exponent 0, all frames would have the same influence. With the exponent
+-1, all postures would have the same influence.
 """
 
 from __future__ import annotations

@@ -3,7 +3,9 @@ r"""Ridge regression through the origin with Huber weights.
 .. math:: H = \sum_i w_i h_i g_i g_i^T + \lambda n I, \qquad
           C = H^{-1} \sum_i w_i h_i g_i \rho_i^T
 
-where w are the weights of the frames with mean 1, and h the Huber weights.
+where :math:`g_i` are the scaled regressors of frame i, :math:`\rho_i` its targets, w the weights of
+the frames with mean 1, h the Huber weights, n the number of frames, :math:`\lambda` the penalty,
+and C the coefficients.
 
 Regressors are scaled but not centered, because the regression must have no intercept.
 """

@@ -43,7 +43,7 @@ def fit_segment(
         q_world_segment from optical markers in the same world. Frames with any NaN are ignored.
     trials : array_like of int, shape (n,), optional
         Movement label of each frame; one movement by default. Generalization between movements
-        determines the size of the correction and its claimed uncertainty.
+        determines the size of the correction and its standard deviation.
 
     Raises
     ------

@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 
 
 MOST = 800
-"""Largest number of frames. The models have a few hundred parameters; a frame has 50 bytes."""
+"""Largest number of frames. The models have a few hundred parameters. A frame of four sensors and
+two segments has 50 bytes.
+"""
 CELL = 0.25
 """Width of a posture cell, rad."""
 MOVEMENTS = 3

@@ -1,7 +1,8 @@
 """Grid search for the center with the smallest variance of distances.
 
-This is the published method to which the other planar methods are compared. The accuracy is limited
-by the extent of the grid on short arcs, and by the step of the grid on long arcs.
+This method of Akbarifar et al. (2021) is the baseline to which the other planar methods are
+compared. Its accuracy is limited by the extent of the grid on short arcs, and by the step of the
+grid on long arcs.
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ def grid_center(points: ArrayLike, grid: Grid) -> Array:
 
     .. math:: J(p) = \sum_n d_n^2 - \Big(\sum_n d_n\Big)^2 / N, \qquad d_n = |p - x_n|
 
-    Source: Akbarifar et al. 2021, section 2-1-2 and equation 9 with corrected index and mean.
+    Source: Akbarifar et al. 2021, section 2-1-2 and equation 9. The index and the mean of the
+    published equation are corrected.
 
     Parameters
     ----------

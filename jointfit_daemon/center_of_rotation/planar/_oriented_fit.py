@@ -189,8 +189,9 @@ def limit_center(center: Array, C: Array, circle: Circles) -> tuple[Array, Array
     if not bool(circle.valid):
         return center, C, 0.0
     spread, axes = np.linalg.eigh(circle.covariance)
-    # E may be nearly singular or indefinite, so its variances are set to at least a quarter of the
-    # variances of the circle's center
+    # E, the covariance of the difference between the two centers, may be nearly singular or
+    # indefinite. Its variances are therefore set to at least a quarter of the variances of the
+    # circle's center.
     apart = np.einsum("ai,ab,bi->i", axes, circle.covariance - C, axes)
     apart = np.maximum(apart, 0.25 * np.maximum(spread, 1e-18))
     delta = center - circle.center

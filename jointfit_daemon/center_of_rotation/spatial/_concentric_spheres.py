@@ -8,8 +8,9 @@ condition
           = 0 \text{ at the smallest } \eta
 
 gives all markers the weights of a geometric fit. n_j is the number of frames of marker j and s_j
-its relative noise variance. The term E_j, the contribution of unit noise to var F_j, removes the
-bias on short arcs. For one marker in a plane the center equals the center of the Hyper fit
+its relative noise variance. The root η is the estimated noise variance. The term E_j, the
+contribution of unit noise to var F_j, removes the bias on short arcs. For one marker in a plane the
+center equals the center of the Hyper fit
 (Al-Sharadqah and Chernov 2009; Kanatani and Rangarajan 2011). For spheres the center is the limit
 of the iteration of Halvorsen 2003.
 """
@@ -89,9 +90,9 @@ class ConcentricSpheres:
     radii2: Array
     """Squared radius of each marker, m², shape (k,)."""
     information: Array
-    """Squared change of the marker directions, summed over frames and markers, minus the noise
-    contribution, shape (r, r). The weight of a marker is the ratio of the common noise variance to
-    its own noise variance.
+    """Squared change of the directions from the center to the markers, summed over frames and
+    markers, minus the contribution of noise, shape (r, r). The weight of a marker in the sum is the
+    ratio of the common noise variance to the noise variance of the marker.
     """
     floor: Array
     """Contribution of noise to the sum in `information`, shape (r, r)."""
@@ -130,7 +131,7 @@ def common_center(paths: MarkerPaths) -> ConcentricSpheres | None:
     noise2 = max(eta, _NOTHING_M2) * total / max(total - k - len(m), 1.0)
     w = paths.n / (R2 * relative)
 
-    # relative to its own mean, a path of n frames contains the fraction 1 - 1/n of the noise
+    # relative to its mean over n frames, a path contains the fraction 1 - 1/n of the noise variance
     left = (1.0 - 1.0 / np.maximum(paths.n, 1.0)) * noise2 * relative
     floor = np.einsum("j,jab->ab", w * left, paths.S)
     information = np.einsum("j,jab->ab", w, paths.C) - floor

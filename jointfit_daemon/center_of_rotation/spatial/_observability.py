@@ -37,9 +37,9 @@ rotation, must exceed the apparent rotation that noise causes. Without this limi
 frames would seem to determine the center along the axis of a hinge.
 """
 FADED = 0.5 ** LAGS[1]
-"""Largest correlation over `LAGS[1]` frames that is attributed to noise. The value is the
-correlation of noise whose correlation halves from frame to frame. A larger correlation is
-attributed to soft-tissue artefact.
+"""Largest correlation over `LAGS[1]` frames that is attributed to noise. The value applies to noise
+whose correlation halves from frame to frame. A larger correlation is attributed to soft-tissue
+artefact.
 """
 FILLED = 0.1
 """Ratio of the variance of the radial residuals to the variance of the path, above which the path
@@ -218,9 +218,9 @@ def _observed_center(
 
     where e are the radial residuals of markers j and l, u the unit vectors from the center to the
     markers, s the relative noise, and B the information. n_jl is the number of frames in which both
-    markers are visible. ρ and ρ_u are the lag-one correlations of e and u. Persistent noise
-    increases the covariance only if the movement is persistent as well. The function adds
-    `soft_tissue_variance` divided by the information.
+    markers are visible. ρ and ρ_u are the correlations of e and of u from one frame to the next.
+    Correlated residuals e increase the covariance only if the directions u are correlated as well.
+    The function adds `soft_tissue_variance` divided by the information.
     """
     k, rank = paths.mean.shape
     total = float(paths.n.sum())
@@ -255,7 +255,8 @@ def _observed_center(
 def _no_better(spread: Array, white: Array) -> Array:
     """Return `spread`, increased to at least a quarter of the white-noise covariance.
 
-    With few frames, chance correlations between markers could cancel all noise.
+    With few frames, correlations between markers that occur by chance could make `spread` almost
+    zero.
     """
     L = np.linalg.cholesky((white + white.T) / 2.0)
     inner = np.linalg.solve(L, np.linalg.solve(L, spread).T)

@@ -60,7 +60,9 @@ def spatial_noise(points: Array, parent: Array, noise: float) -> Array:
 
 
 def turn_noise(parent: Array, noise: float) -> float:
-    r"""Return the RMS rotation error, rad, of a frame fitted to noisy markers about its worst axis.
+    r"""Return the RMS rotation error of a frame fitted to noisy markers, rad.
+
+    The error is the rotation error about the axis with the largest error.
 
     .. math:: σ_φ^2 = σ^2\, λ_{max}(G^{-1})
 

@@ -43,8 +43,8 @@ STAYED_OFF = 25
 position.
 """
 _FAR_M = 2.0
-"""Largest distance of a marker from its fixed point, m, because fourth powers of larger distances
-lose digits.
+"""Largest distance, m, of a marker from its fixed point, which is its first visible position.
+Fourth powers of larger distances lose digits.
 """
 
 

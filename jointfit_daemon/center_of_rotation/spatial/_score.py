@@ -37,8 +37,10 @@ if TYPE_CHECKING:
 
 
 HINGE_RATIO = 0.3
-"""Ratio σ₆/σ₅ of the two smallest singular values below which only an axis was observed. The ratio
-is 0.07 to 0.35 for hips in squats, and at least 0.85 for a ball joint moved in all directions."""
+"""Ratio σ₆/σ₅ of the two smallest singular values of N below which only an axis was observed. The
+ratio is 0.07 to 0.35 for hips in squats, and at least 0.85 for a ball joint moved in all
+directions.
+"""
 MIN_FRAMES = 15
 FEW = f"fewer than {MIN_FRAMES} frames show both bodies: keep three markers of each body visible"
 SEVERAL_AXES = (
@@ -250,7 +252,7 @@ def _huber_weights(N: Array, rhs: Array, *, hinge: bool) -> Array:
 def _solve(
     N: Array, rhs: Array, w: Array, *, hinge: bool
 ) -> tuple[Array, Array, Array, Array, int]:
-    """Return both points (6,), gaps (n, 3), singular values, right vectors and rank."""
+    """Return both points (6,), gaps (n, 3), singular values, right singular vectors and rank."""
     root = np.sqrt(w)[:, None]
     U, s, Vt = np.linalg.svd((root[..., None] * N).reshape(-1, 6), full_matrices=False)
     rank = 5 if hinge or s[5] < HINGE_RATIO * s[4] else 6

@@ -125,7 +125,7 @@ def _answer(
     stay = middle if near is None else np.asarray(near, dtype=np.float64)
     center, spread = shrink_center(seen, middle @ seen.basis)
     fitted = seen.basis @ center
-    hidden = unseen @ seen.basis @ seen.basis.T  # fitted, but not part of the result
+    hidden = unseen @ seen.basis @ seen.basis.T  # directions in the fit that the result excludes
     lean = float(((unseen @ stay - hidden @ fitted - (unseen - hidden) @ middle) ** 2).sum())
     spread = seen.shown.T @ spread @ seen.shown
     C = basis @ (spread + lean * (seen.shown.T @ seen.tilt @ seen.shown)) @ basis.T
@@ -174,7 +174,8 @@ def shrink_center(seen: ObservedCenter, middle: Array) -> tuple[Array, Array]:
     where d is the vector from the markers' mean to the center, with covariance C. The error of the
     estimated curvature is nearly normal. The inverse of the curvature, the distance, is therefore
     too large on average. The shrinkage is Zellner's minimum expected loss estimator of an inverse
-    (1978), and removes this outward bias, as in the plane. On long arcs S is nearly the identity.
+    (1978). It removes this outward bias, as `temper` does for circles. On long arcs S is nearly the
+    identity.
     """
     R2 = float(np.median(seen.found.radii2))
     S = np.linalg.inv(np.eye(len(middle)) + seen.spread / R2)

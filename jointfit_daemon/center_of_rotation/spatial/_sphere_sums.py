@@ -8,10 +8,10 @@ fixed point near the marker. All estimates of spheres about one center are funct
 .. math:: M_{jl} = \sum_t \sqrt{w_{tj} w_{tl}}\, φ_{tj} φ_{tl}^T, \qquad
           L_{gj} = \sum_t \sqrt{w_{tj} w_{t-g,j}}\, φ_{tj} φ_{t-g,j}^T, \quad g \in \{1, 4\}
 
-where w is the weight of marker j or l in frame t. M determines the variances of the residuals and
-their covariance between markers, which noise of the parent's frame causes. L determines the
-correlation of the residuals in time. Forgetting multiplies M and L by a factor. A marker that is
-not visible adds nothing to either sum.
+where w is the weight of marker j or l in frame t. M determines the variance of the residuals of
+each marker, and their covariance between two markers. Noise of the parent's frame causes this
+covariance. L determines the correlation of the residuals in time. To forget old frames, M and L are
+multiplied by a factor below 1. A marker that is not visible adds nothing to either sum.
 """
 
 from __future__ import annotations

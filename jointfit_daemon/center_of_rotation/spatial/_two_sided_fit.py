@@ -102,7 +102,7 @@ def fit_two_sides(
     *,
     robust: bool,
 ) -> TwoSidedFit:
-    r"""Fit the point of two bodies that coincides in every frame, by the Gauss-Helmert method.
+    r"""Fit the points of two bodies that coincide in every frame, by the Gauss-Helmert method.
 
     .. math:: \min \sum_t \sum_{i=1,2} \left( k_i |\rho_{it}|^2 + \varphi_{it}^T G_i \varphi_{it}
               \right) \quad \text{subject to} \quad

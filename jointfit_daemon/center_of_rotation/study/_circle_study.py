@@ -45,7 +45,8 @@ limit.
 """
 PRINTED = {"α–σ": (0.99, 0.78), "r–σ": (0.99, 0.98), "r–α": (0.99, 0.94)}
 """Correlations in table 1 of the source. The first number of a pair is the correlation of the
-analytic solution with the prediction, the second its correlation with the grid search.
+analytic solution with the prediction. The second number is the correlation of the analytic solution
+with the grid search.
 """
 
 

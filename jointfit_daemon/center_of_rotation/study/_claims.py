@@ -72,7 +72,7 @@ def effect_of_radius(setup: StudySetup) -> Array:
 
 
 class StudyExtension(NamedTuple):
-    """Results of the study that the source does not contain."""
+    """Results that the source of the study does not contain."""
 
     median_errors: Mapping[str, Array]
     """Median errors of `compare_methods`, m, by method."""

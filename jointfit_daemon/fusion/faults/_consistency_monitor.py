@@ -69,9 +69,10 @@ grows with the square of the number of sensors.
 def compared_pairs(group: Sequence[str]) -> list[tuple[str, str]]:
     """Return the pairs of sensors of one segment that are compared, in the order of `group`.
 
-    If a segment has many sensors, the first is compared with all others. Each of the others is also
-    compared with its two neighbors in a ring. A single slipped sensor then contradicts exactly its
-    own pairs, even if another sensor is lost.
+    If a segment has more than `MOST_PAIRED` sensors, the first is compared with all others. The
+    others form a ring, and each of them is also compared with its two neighbors in this ring. If a
+    single sensor slips, all pairs that contain this sensor are inconsistent, and no other pairs.
+    This is true even if another sensor is lost.
     """
     pairs, last = combinations(range(len(group)), 2), len(group) - 1
     return [
@@ -308,7 +309,10 @@ class ConsistencyMonitor:
         return corrections.get(b, 0.0) - corrections.get(a, 0.0) if corrections else 0.0
 
     def _is_tilted(self, *sensors: str) -> bool:
-        """Return whether one of the sensors belongs to a pair that deviates not only in heading."""
+        """Return whether one of the sensors belongs to a pair with a deviation beyond heading.
+
+        `SlipDetector.tilted` defines such a deviation.
+        """
         return not self._all_consistent and any(
             pair.tilted and (pair.link.a in sensors or pair.link.b in sensors)
             for consistent, pairs in zip(self._consistent, self._pairs, strict=True)

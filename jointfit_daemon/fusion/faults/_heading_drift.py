@@ -33,7 +33,7 @@ per minute.
 RATE_S = 300.0
 """Correlation time of the drift rate, s."""
 BIAS_S = 15.0
-"""Correlation time of the measurement bias, s. A movement rarely lasts longer."""
+"""Correlation time of the measurement bias, s. A movement rarely lasts longer than this time."""
 START_SD = radians(1.0)
 """Standard deviation of the headings just after a static pose, rad."""
 OUTLIER_SIGMA = 5.0

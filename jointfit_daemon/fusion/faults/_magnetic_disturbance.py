@@ -126,8 +126,8 @@ class MagneticDisturbanceDetector:
     def outlier(self, a: str, b: str) -> tuple[str, float] | None:
         """Return the disturbed sensor of a pair and its deviation, rad, or None.
 
-        The disturbed sensor is corrected, and the deviation of the other sensor is less than half
-        as large.
+        The sensor with the larger deviation counts as disturbed if it is corrected, and if the
+        deviation of the other sensor is less than half as large.
         """
         deviations = self._deviations
         larger = abs(deviations.get(a, 0.0)) > abs(deviations.get(b, 0.0))
@@ -175,7 +175,8 @@ class MagneticDisturbanceDetector:
                 correction = _ramp(heading - middle, sd)
                 if correction:
                     targets[name] = correction
-                    # The same object may also disturb the other sensors, too little to be observed.
+                    # The object that disturbs this sensor may also disturb the other sensors, by
+                    # angles that are too small to be observed.
                     ambiguity = max(ambiguity, min(abs(correction), sd))
             ambiguity = max(ambiguity, _ramp(0.5 * (high - low), sd))
         return targets, ambiguity

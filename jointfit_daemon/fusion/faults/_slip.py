@@ -29,8 +29,8 @@ RELEASE_NS = 2_000_000_000
 """Time below the release limit after which the pair is consistent again, ns."""
 LIMIT_FACTOR = 2.4
 """Limit of the smoothed difference in units of its usual RMS length. Without a fault the smoothed
-difference stays below 1.5 for hours with simulated soft tissue. It stays below 2.1 in recorded
-movements outside the training range.
+difference stays below 1.5 of these units for hours with simulated soft tissue. It stays below 2.1
+units in recorded movements outside the training range.
 """
 MIN_LIMIT = radians(6.0)
 """Smallest limit, rad."""
@@ -79,7 +79,11 @@ def pair_corrections(pairs: Sequence[SlipDetector]) -> dict[str, Quaternion]:
 
 
 class FaultDebouncer:
-    """Sets a fault after `ONSET_NS` above a limit; clears it after `RELEASE_NS` well below."""
+    """Sets and clears a fault from a difference and its limit.
+
+    The fault is set after the difference was above the limit for `ONSET_NS`. It is cleared after
+    the difference was below `RELEASE_SHARE` times the limit for `RELEASE_NS`.
+    """
 
     def __init__(self) -> None:
         self.active = False
@@ -147,7 +151,11 @@ class SlipDetector:
 
     @property
     def tilted(self) -> bool:
-        """Whether an active or pending inconsistency is not only a difference in heading."""
+        """Whether an active or pending inconsistency contains a tilt.
+
+        A tilt is a rotation about a horizontal axis by more than `TILT_SHARE` times the limit. An
+        inconsistency without a tilt is a difference in heading.
+        """
         return not self.consistent and hypot(*self._tilt) > TILT_SHARE * self.limit
 
     @property

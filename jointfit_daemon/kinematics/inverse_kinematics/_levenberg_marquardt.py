@@ -50,8 +50,8 @@ _EASIER = 0.2
 _HARDER = 8.0
 """Factor by which the damping is multiplied after a rejected step."""
 _HOPELESS = 1e6
-"""Damping above which the search at an instant ends without convergence. At a minimum it is not
-reached, because the damping first reduces the steps below `_STILL`.
+"""Damping above which the search at an instant ends without convergence. At a minimum of the cost
+this damping is not reached, because smaller damping already reduces the steps below `_STILL`.
 """
 _RIDGE = 1e-10
 """Absolute damping, for degrees of freedom without information."""

@@ -53,7 +53,10 @@ _LAST_STEP = 3e-3
 _DAMPING = 1e-2
 _RIDGE = 1e-9
 _ROUNDING = 1e-9
-_OPEN_SLACK = 1e-2  # tolerance, because the regularization may increase the marker cost
+_OPEN_SLACK = 1e-2
+"""Accepted relative increase of the marker cost in a regularized step, because the regularization
+may increase this cost.
+"""
 _FORGETTING = 0.02
 _FIRST_SD_M = 0.003
 _FIRST_INSTANTS = 5
