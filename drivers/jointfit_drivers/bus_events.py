@@ -1,5 +1,8 @@
 """Events of corrupt data and errors on a CAN bus, for the decoder of one device on the bus.
 
+The bus delivers records of 24 bytes. A record contains a CAN frame, an error frame of the
+controller, or the number of frames or bytes that this host lost.
+
 Invariant: the output depends only on the frames added. The module reads no clock and no bus.
 """
 

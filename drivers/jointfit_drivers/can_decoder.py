@@ -28,7 +28,8 @@ class CanDecoder(ABC):
     Parameters
     ----------
     ids : collection of CanKey
-        Identifiers of the device, each with a flag for 29 bits. Other frames are ignored.
+        Identifiers of the device's frames, each with a flag that is true if the identifier has 29
+        bits. Other frames are ignored.
     samples : CheckedSamples
         Object that checks each sample. `convert` passes its samples to this object.
     """
@@ -76,5 +77,8 @@ class CanDecoder(ABC):
         return out
 
     def flush(self) -> list[Decoded]:
-        """Reject the sample that waits for confirmation, if there is one, and return the events."""
+        """Reject the sample that waits for confirmation, if there is one, and return the events.
+
+        A sample waits if its time or counter contradicts the samples before it.
+        """
         return self.samples.flush()

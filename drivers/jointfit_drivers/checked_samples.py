@@ -30,6 +30,8 @@ _WRONG_RATE = 0.1
 
 
 class _HeldSample(NamedTuple):
+    """Sample whose time or counter contradicts the samples before it. The next sample decides."""
+
     sample: ImuSample
     size: int
 
@@ -47,8 +49,8 @@ class CheckedSamples(Refusals):
         Number of values of the message counter, for example 256 for one byte; None if the
         counter never wraps.
     tolerance : float
-        Largest deviation of the quaternion norm from 1. Use 0.05 for components that
-        are integers in thousandths.
+        Largest deviation of the quaternion norm from 1. Use 0.05 if the quaternion components are
+        sent as integer thousandths.
     """
 
     def __init__(
@@ -96,7 +98,7 @@ class CheckedSamples(Refusals):
             out += self._admit(*held)
             lost = step.lost_since
         else:
-            out = self.flush()  # this sample contradicts the held sample
+            out = self.flush()  # `sample` does not confirm the held sample
             lost = step.lost
 
         # A single sample cannot prove a restart, because some corrupt messages pass a checksum.

@@ -26,6 +26,7 @@ class Refusals:
     def flush(self) -> list[Decoded]:
         """Reject the sample that waits for confirmation, and return the events.
 
-        Only subclasses have such samples.
+        A subclass may delay a sample whose time or counter contradicts the samples before it, until
+        the next sample confirms or contradicts it.
         """
         return []

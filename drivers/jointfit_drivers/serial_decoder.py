@@ -47,7 +47,8 @@ class SerialMessageDecoder(ABC, Generic[Message]):
     refusals : Refusals
         Counter of the messages that yielded no sample.
     baud : int, optional
-        Line speed, bit/s, for back-dating of stamps; None for USB, whose bytes have no duration.
+        Line speed, bit/s, from which the arrival of the first byte of a message is computed; None
+        for USB, because its bytes arrive together.
     longest : int
         Size of the largest message, bytes.
     """
@@ -98,7 +99,8 @@ class SerialMessageDecoder(ABC, Generic[Message]):
     def flush(self) -> list[Decoded]:
         """Discard an incomplete message and a sample that waits for confirmation.
 
-        Return the samples and events that result.
+        A sample waits if its time or counter contradicts the samples before it. Return the samples
+        and events that result.
         """
         out: list[Decoded] = []
         self._append(self._codec.flush(), out)

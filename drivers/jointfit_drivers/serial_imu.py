@@ -115,7 +115,7 @@ class ArrivalStamps:
     Parameters
     ----------
     baud : int, optional
-        Line speed, bit/s; None for USB, whose bytes have no duration.
+        Line speed, bit/s; None for USB, because its bytes arrive together.
     most_bytes : int
         Size of the largest message, bytes.
     """

@@ -1,8 +1,8 @@
 """Check of device time for lost messages, restarts and corruption, without a message counter.
 
-A message *follows* another message if device time did not decrease, and if it advanced by at most
-five periods or by about as much as the arrival time. The second comparison allows for a backlog of
-buffered messages.
+A message *follows* another message if device time did not decrease, and if device time advanced by
+at most five periods or by about as much as the arrival time. The comparison with the arrival time
+allows for a backlog of buffered messages.
 
 | message                                       | outcome                                         |
 |-----------------------------------------------|-------------------------------------------------|
@@ -28,7 +28,7 @@ from jointfit_drivers.backlog import BacklogDelay, device_continued
 _FEW = 5
 """Number of periods by which device time may always advance, regardless of the arrival time."""
 _GAP = 1.5
-"""Largest step without a lost message, periods."""
+"""Largest step without a lost message, in periods."""
 _ALIKE = 0.3
 """Largest relative difference between two steps without a lost message."""
 _STEPS = 3

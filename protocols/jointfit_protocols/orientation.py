@@ -23,8 +23,8 @@ _S = sqrt(0.5)
 _CHECKED = 100
 """Number of samples after which the share of rejected samples is checked."""
 _MOST_REJECTED = 90
-"""Number of rejected samples out of `_CHECKED`. Only a wrong byte order or scale can explain
-more."""
+"""Largest number of rejected samples out of `_CHECKED` that is possible with a correct byte order
+and scale."""
 
 
 def canonical(
@@ -92,7 +92,7 @@ class OrientationGate:
         self._norms: list[float] = []
 
     def admit(self, q: Quaternion) -> Quaternion | None:
-        """Return `q` as a unit quaternion, with the sign nearest to the last result.
+        """Return `q` as a unit quaternion, with the sign that is nearer to the last result.
 
         The result is None if `q` is rejected.
         """

@@ -49,7 +49,7 @@ class Bno085Imu:
             The port is absent, in use, unplugged, or silent for ``lost_after_s``. A retry may
             succeed.
         DeviceMisconfiguredError
-            `port` is not a serial port, or the device is of another kind, in another mode, or does
+            `port` is not a serial port, or the device is not a BNO085, is in another mode, or does
             not accept the rate.
         """
         settings = self._settings

@@ -130,7 +130,7 @@ async def ensure_shtp(port: SerialPort, emit: Emit, settings: Bno085Settings) ->
     DeviceLostError
         The device does not answer, or has stopped answering.
     DeviceMisconfiguredError
-        The device is of another kind or in another mode, or does not accept the rate.
+        The device is not a BNO085, is in another mode, or does not accept the rate.
     """
     held: list[Chunk] = []  # received during the configuration; emitted at the end
     conversation = ShtpConversation(port, held.append)

@@ -51,8 +51,8 @@ _DISTINCT = 0.2
 _COMPARED = 100
 """Number of frames at rest after which the two orders of axes are compared."""
 _BETTER = 3.0
-"""Smallest ratio of the deviation of the configured axis order to the deviation of the other order
-that causes a warning."""
+"""Smallest ratio of two deviations from the measured accelerations that causes a warning: the
+deviation of the configured axis order, divided by the deviation of the other order."""
 _G_COUNTS = 1000.0
 
 
@@ -62,7 +62,8 @@ class RvcDecoder(SerialMessageDecoder[RvcFrame]):
     Parameters
     ----------
     baud : int, optional
-        Line speed, bit/s, for back-dating of stamps; None for USB.
+        Line speed, bit/s, from which the arrival of the first byte of a message is computed; None
+        for USB.
     euler : str
         Axes of yaw, pitch and roll, ``zxy`` or ``zyx``.
     """
@@ -90,7 +91,7 @@ class RvcDecoder(SerialMessageDecoder[RvcFrame]):
         arrival_ns = self._arrival_of(message)
         x, y, z = message.acceleration
         force = (_FORCE * x, _FORCE * y, _FORCE * z)
-        if q is not None:  # the norm is 1 except for rounding
+        if q is not None:  # always true, because `quaternion_of` returns norm 1
             out.append(ImuSample(arrival_ns, q, native, None, message.number, acceleration=force))
         if self._compared < _COMPARED:
             out += self._compare(message)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 RVC_BAUD, SHTP_BAUD = 115_200, 3_000_000
-"""Speeds of the two modes, which the pins PS0 and PS1 select, bit/s."""
+"""Line speeds of the modes UART-RVC and UART-SHTP, bit/s. The pins PS0 and PS1 select the mode."""
 RVC_HZ = 100
 """Output rate of the mode UART-RVC, Hz."""
 MAX_RATE_HZ = 400

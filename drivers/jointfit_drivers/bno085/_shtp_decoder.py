@@ -69,7 +69,8 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
     Parameters
     ----------
     baud : int, optional
-        Line speed, bit/s, for back-dating of stamps; None for USB.
+        Line speed, bit/s, from which the arrival of the first byte of a message is computed; None
+        for USB.
     raw : RawSamples, optional
         Filter that computes orientations from raw readings; None if the device sends rotation
         vectors.
@@ -100,7 +101,7 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         self._reading_ns = self._readings = self._first_ns = 0
 
     @override
-    def _take(  # noqa: PLR0911 - one for each channel
+    def _take(  # noqa: PLR0911 - one return for each channel
         self, message: ShtpPacket | ShtpBufferStatus
     ) -> list[Decoded]:
         if isinstance(message, ShtpBufferStatus):

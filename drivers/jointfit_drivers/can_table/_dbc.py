@@ -1,5 +1,8 @@
 """Positions of signals in CAN frames, from a DBC file. `cantools` (extra ``dbc``) reads the file.
 
+A DBC file describes the frames and signals of a CAN bus. A multiplexer is a signal whose value
+selects the other signals of the same frame.
+
 Invariant: only the functions of this module import `cantools`.
 """
 

@@ -133,7 +133,7 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
         multiplexer_faults = self._multiplexers()[1]
         yield from multiplexer_faults
         if multiplexer_faults:
-            return  # the other faults would be consequences
+            return  # further faults would be consequences of these faults
         sizes = dict.fromkeys(range(len(self.ids)), _FRAME_BYTES)
         yield from overlap_faults(form, self._first_bytes(), sizes)
         if not form.faults or self.dbc is None:  # a faulty signal has no multiplexer

@@ -3,8 +3,9 @@ r"""Computation of the orientation from the raw measurements of one IMU, by the 
 VQF stands for "versatile quaternion-based filter". A relative error of the sample interval causes
 the same relative error of every rotation. The interval is therefore computed from the device time
 (`RawReading.t_ns`). The filter has a fixed step, which is the first interval T_s. If the device
-time has a coarse resolution, the mean interval :math:`\bar T` differs from T_s. The angular rate
-:math:`\omega` is therefore scaled so that every step rotates by the true angle:
+time has a coarse resolution, the mean interval :math:`\bar T` differs from T_s. The filter
+therefore receives the angular rate :math:`\omega` with a scale, so that every step rotates by the
+true angle:
 
 .. math:: \omega_\text{fed} = \omega\, \bar T / T_s
 
@@ -12,20 +13,20 @@ Up to three missing measurements are interpolated. After a longer gap the filter
 last gyroscope bias. Without a magnetometer, it also continues with the last heading, which is then
 uncertain.
 
-A filter that has just started takes its vertical from one accelerometer measurement. In fast motion
-the RMS error of the orientation is 18 degrees in the first second, 6 degrees in the second and 4
-degrees in the third (one IMU on a rigid board, experiment ``gateway-orientation-start-in-motion``).
-Orientations are therefore returned only when the filter has detected rest or has run for
-`SETTLE_S`, or for ``settle_s`` if this time is shorter.
+A filter that has just started takes its vertical from one accelerometer measurement. In fast
+motion, the RMS error of the orientation is 18 degrees in the first second, 6 degrees in the second
+and 4 degrees in the third. These values are from one IMU on a rigid board (bench experiment
+``gateway-orientation-start-in-motion``). Orientations are therefore returned only when the filter
+has detected rest or has run for `SETTLE_S`, or for ``settle_s`` if this time is shorter.
 
 With a magnetometer, `StartEstimator` then estimates orientation and gyroscope bias from the
 readings since the start, and continues with every reading. Orientations are returned when their
-standard deviation is at most `SETTLED_SD`, or after ``settle_s``. The estimation ends, and its
-result is copied to VQF, at the first rest, or when the standard deviation of the bias is at most
-`KNOWN_BIAS_SD`, or after `CONVERGE_S` at the latest.
+standard deviation is at most `SETTLED_SD`, or after ``settle_s``. The estimation ends at the first
+rest, when the standard deviation of the bias is at most `KNOWN_BIAS_SD`, or after `CONVERGE_S` at
+the latest. Its result is then copied to VQF.
 
 A magnetometer has a delay relative to the gyroscope. For the IMU of the BROAD data set, the delay
-is 13 ms, which causes an error of 8 degrees at an angular rate of 579 degrees per second. The
+is 13 ms. This delay causes an error of 8 degrees at an angular rate of 579 degrees per second. The
 filter estimates the delay from the readings since the start, and compensates it.
 
 Invariant: the output depends only on the readings fed, so a replay yields identical orientations.
@@ -84,8 +85,8 @@ HARDEST = 5000.0
 STRONGEST = 1e6
 """Largest plausible component of the magnetic field in any unit; equal to 1 T in microtesla."""
 FIELD_RATIO = 2.0
-"""Largest ratio of the field strength to its median, or the reverse, at which a reading is used to
-estimate the delay of the magnetometer."""
+"""Largest factor between the field strength and its median, in either direction, at which a reading
+is used to estimate the delay of the magnetometer."""
 RIDGE_RATE = 1.0
 """Angular rate below which the delay of the magnetometer is not estimated, rad/s. At this rate, a
 delay of 20 ms changes the field by at most 2 %."""
@@ -153,7 +154,10 @@ def is_installed() -> bool:
 
 
 def is_plausible(reading: RawReading) -> bool:
-    """Return whether a reading is finite and in range. One NaN would spoil all later outputs."""
+    """Return whether a reading is finite and in range.
+
+    After one NaN, all later outputs of the filter would be NaN.
+    """
     if not all(-FASTEST < value < FASTEST for value in reading.rate):
         return False
     if not all(-HARDEST < value < HARDEST for value in reading.force):
@@ -296,7 +300,7 @@ class GatewayOrientation:
         return self._output(reading, follows=follows)
 
     def _settle(self, t_ns: int, waited_ns: int) -> None:
-        """Start the estimation if it is due, and record whether the filter has settled."""
+        """Estimate orientation and bias when it is time; record whether the filter has settled."""
         rest = self._filter.getRestDetected()
         if not rest and waited_ns < min(self._settle_ns, SETTLE_S * NS_PER_S):
             return

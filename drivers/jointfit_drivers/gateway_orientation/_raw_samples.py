@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from jointfit_drivers.gateway_orientation._settings import GatewaySettings
 
 _REPORT_NS, _SOON_NS = 10_000_000_000, 1_000_000_000
-"""Interval between two events with the state of the filter, and shortest interval after the state
-has changed, ns."""
+"""Intervals between two events with the state of the filter, ns: without a change of the state, and
+the shortest interval if the state has changed."""
 FAST = 5.0
 """Angular rate below which no gyroscope saturates, rad/s."""
 _NEW_HEADING = (
@@ -182,7 +182,10 @@ class RawSamples:
         return out
 
     def _state_events(self) -> list[Decoded]:
-        """Return the event with the filter's state if it is due, and once the heading warning."""
+        """Return the event with the state of the filter, if its interval has passed.
+
+        Without magnetometer, the first call also returns a warning about the arbitrary heading.
+        """
         out: list[Decoded] = []
         if not self._started and not self.magnetometer:
             out.append(DeviceEvent("warning", _NEW_HEADING))

@@ -19,10 +19,11 @@ vector g is gravity, upwards, and :math:`\Delta t` is the length of the step:
     \varphi &\leftarrow \varphi - \sum R\,T\,(b - \hat b) \\
     v &\leftarrow v + \sum R f\,T - g\,\Delta t + \varphi \times \sum R f\,T
 
-There are two observations: the velocity of a body part is limited, and the mean field of the step
-is :math:`\bar y = B + B \times \varphi` with :math:`B = (0, B_n, B_u)`. In both observations, a
-deviation lasts for about a second. The variance of one step is therefore the variance of the
-deviation times `LASTING_S`, divided by the length of the step.
+There are two observations. The first is v = 0, because the velocity of a body part is limited. The
+second is the mean field of the step, :math:`\bar y = B + B \times \varphi` with the east, north and
+up components :math:`B = (0, B_n, B_u)`. In both observations, a deviation lasts for about a second.
+The variance of one step is therefore the variance of the deviation times `LASTING_S`, divided by
+the length of the step.
 
 Invariant: the result depends only on the readings added. The module uses no clock, no device and no
 other filter.
@@ -54,8 +55,8 @@ GRAVITY = 9.81
 SPEED_SD = 0.7
 """Expected standard deviation of the velocity of a body part about its mean, m/s."""
 SPEED_KNOWN_S = 1.0
-"""Weight of `SPEED_SD` in the estimated standard deviation of the velocity, as the duration of
-equivalent observations, s."""
+"""Weight of `SPEED_SD` in the estimated standard deviation of the velocity, expressed as the
+duration of observations that have the same weight, s."""
 FIELD_SD = 0.03
 """Standard deviation of the field during motion, relative to its strength."""
 FIELD_LIMIT = 0.1
@@ -72,9 +73,10 @@ standard deviations `SCALE_SD` and `FORCE_SD`."""
 RATE_NOISE = radians(0.02)
 """Noise of the integrated angle of a gyroscope, rad per root second."""
 TILT_SD = radians(1.0)
-"""Standard deviation of the first vertical if the velocity of the sensor does not change, rad."""
+"""Standard deviation of the first estimate of the vertical if the velocity of the sensor does not
+change, rad."""
 HEADING_SD = 0.5
-"""Standard deviation of the first heading, rad."""
+"""Standard deviation of the first estimate of the heading, rad."""
 
 _PHI, _BIAS, _VELOCITY, _FIELD = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11)
 _SIZE = 11

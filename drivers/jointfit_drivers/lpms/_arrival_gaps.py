@@ -14,11 +14,11 @@ from typing import NamedTuple
 from jointfit_daemon.units import NS_PER_S
 
 _SAMPLES = 10
-"""Number of samples in a window."""
+"""Number of samples in a window. The smallest delay of each window is used."""
 _LOST = 0.75
-"""Increase of the smallest delay that proves a loss, periods."""
+"""Increase of the smallest delay that proves a loss, in periods."""
 _DRIFT = 0.1
-"""Largest increase of the smallest delay, per window, that the skew of a clock causes, periods."""
+"""Largest increase of the smallest delay per window that the skew of a clock causes, in periods."""
 _WRONG_RATE = 0.2
 """Smallest relative difference between mean and nominal interval at which the rate counts as
 wrong."""

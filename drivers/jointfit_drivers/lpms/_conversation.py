@@ -58,8 +58,8 @@ class LpBusConversation(SerialConversation[LpBusMessage]):
         """Stop the stream, and return whether the sensor replied.
 
         Old firmware does not acknowledge this command. Without an acknowledgement, the driver sends
-        a read command that exists in both generations. A reply shows that the sensor is in command
-        mode.
+        a read command that exists in both generations of sensors. A reply shows that the sensor is
+        in command mode.
 
         Parameters
         ----------

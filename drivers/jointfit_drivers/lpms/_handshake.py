@@ -4,8 +4,8 @@ The driver reads the settings of the sensor and writes only settings that differ
 then reads them again, because old firmware acknowledges nothing. The sensor stores the settings in
 flash only with ``persist``.
 
-Some commands have a different meaning in the other generation of sensors. Before the first such
-command, the driver sends a query that has no effect in either generation. The reply shows the
+Some commands have different meanings in the two generations of sensors. Before the first such
+command, the driver sends a query that changes no setting in either generation. The reply shows the
 generation.
 """
 
@@ -39,8 +39,8 @@ LINE_SPEEDS = (115_200, 921_600, 460_800, 230_400, 57_600, 38_400, 19_200, 9_600
 _LISTEN_S = 0.15
 """Longest wait for an answer at each speed, s."""
 _QUIET_S = 1.2
-"""Silence, s, after which the earlier bytes count as noise. Devices of other kinds may send only
-once a second."""
+"""Silence, s, after which the earlier bytes count as noise. It is longer than one second, because a
+device that is not an LPMS sensor may send only once a second."""
 _STORE_S = 3.0
 """Longest wait for the acknowledgement of a flash write, s."""
 _FIRST_S, _FIRST_PERIODS = 1.0, 5
@@ -79,8 +79,8 @@ class LpmsHandshake:
         DeviceLostError
             The sensor does not answer, was unplugged, or stopped answering.
         DeviceMisconfiguredError
-            The speed, generation or address differs from the settings, the device is of another
-            kind, or it does not accept the settings.
+            The speed, generation or address differs from the settings, the device is not an LPMS
+            sensor, or it does not accept the settings.
         """
         settings = self._settings
         settings.require_line_speed("the speed of the sensor")
@@ -94,7 +94,10 @@ class LpmsHandshake:
         await self._start()
 
     async def _ensure_generation(self) -> None:
-        """Reject a sensor of the other generation, whose settings a later command could erase."""
+        """Reject a sensor of the generation that is not configured.
+
+        A later command could erase the settings of this sensor.
+        """
         reply = await self._conversation.read(LpmsCommand.IDENTIFY)
         found = None if reply is None else identify_generation(reply)
         if found is None:

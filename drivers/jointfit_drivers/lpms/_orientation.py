@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 _CHECKED = 100
 """Number of quaternions whose norms are checked and reported once."""
 _COARSE_TOLERANCE = 0.05
-"""Largest deviation of the norm from 1 for quaternions in thousandths."""
+"""Largest deviation of the norm from 1 for quaternions whose components are integer thousandths."""
 
 
 class LpmsConvention(NamedTuple):

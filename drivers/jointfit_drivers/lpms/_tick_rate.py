@@ -21,9 +21,9 @@ _CONTRADICTIONS = 2
 _NEAR = 0.05
 """Largest relative deviation of a measured rate from the rate that it confirms."""
 _MOST_RATIO = 4.0
-"""Largest ratio of a measured rate to the configured rate, or the reverse, at which an unusual rate
-is reported. If a file of raw bytes is decoded, its stamps are closer together than arrival times,
-so the ratio is larger."""
+"""Largest factor between the measured and the configured rate, in either direction, at which an
+unusual rate is reported. The stamps of a decoded file of raw bytes are closer together than arrival
+times. The factor is then larger, and no rate is reported."""
 _USUAL_HZ = (400, 500, 800, 1000)
 
 

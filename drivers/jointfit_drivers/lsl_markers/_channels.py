@@ -1,13 +1,13 @@
 """Assignment of the channels of an LSL stream to marker coordinates and body poses.
 
-The convention is the MoCap meta-data of XDF, the file format of LSL. Each channel has a label,
+The assignment follows the MoCap meta-data of XDF, the file format of LSL. Each channel has a label,
 the name of a marker or object, a type (PositionX to Z, OrientationA to D, or Confidence) and a
 unit. If the type is missing, the end of the label (``T1_X``, ``Thigh.qw``, ``Thigh_quat_w``)
 replaces it. If the channels have no labels, rig.toml defines the labels, or the names of the
 markers, each of which has the three channels x, y and z.
 
-The convention does not define which of OrientationA to D is the scalar. PhaseSpace sends the scalar
-first. The OptiTrack program of LSL sends it last.
+The meta-data do not define which of OrientationA to D is the scalar. PhaseSpace sends the scalar
+first. The OptiTrack program of LSL sends the scalar last.
 
 Invariant: the functions are pure. An unknown channel is ignored and never guessed. If all channels
 are unknown, a warning reports this fact.
@@ -44,8 +44,8 @@ _LABEL = re.compile(
     re.IGNORECASE,
 )
 _LAST_SCALAR = "naturalpoint"
-"""Manufacturer in the streams of the OptiTrack program of LSL, which sends the quaternion of a body
-as x, y, z, w in the channels OrientationA to D."""
+"""Manufacturer in the streams of the OptiTrack program of LSL. This program sends the quaternion of
+a body as x, y, z, w in the channels OrientationA to D."""
 _UNITS_M = {
     "m": 1.0, "meter": 1.0, "meters": 1.0, "metre": 1.0, "metres": 1.0,
     "cm": 0.01, "centimeter": 0.01, "centimeters": 0.01, "centimetre": 0.01, "centimetres": 0.01,
@@ -135,7 +135,8 @@ def stream_layout(description: StreamDescription, settings: LslMarkersSettings) 
 
 
 _Found = dict[tuple[str, str, bool], dict[str, int]]
-"""Channel number of each component, by owner, name, and whether the name belongs to an object."""
+"""Channel number of each component. The key contains the object that owns a marker, the name of the
+marker or object, and whether the name belongs to an object."""
 
 
 def _named_channels(

@@ -1,10 +1,10 @@
-"""Decoder of LSL streams: converts chunks to optical frames and clock echoes.
+"""Decoder of LSL streams: converts chunks to optical frames and clock comparisons (`ClockEcho`).
 
 Each sample of the stream becomes one frame. A position counts as occluded if a coordinate is not
 finite, if all three coordinates are exactly zero, or if its confidence is not positive. Some
 programs stamp samples with the time of their cameras instead of the LSL clock. The decoder
-therefore checks the stamps. If they are on the LSL clock, each comparison of the sender's LSL clock
-with the host clock is returned as an echo.
+therefore checks the stamps. If the stamps are times of the LSL clock, the decoder returns each
+comparison of the sender's LSL clock with the host clock as a `ClockEcho`.
 
 Invariant: the output depends only on the chunks fed. The decoder reads no clock and no stream.
 """
@@ -106,7 +106,7 @@ class LslMarkersDecoder:
         return () if self._described is None else (self._described,)
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return the frames, echoes and events of `chunk`; never raise."""
+        """Return the frames, clock comparisons and events of `chunk`; never raise."""
         out: list[Decoded] = []
         for message in self._codec.feed(chunk.data):
             match message:
@@ -169,7 +169,7 @@ class LslMarkersDecoder:
     # --- time ---------------------------------------------------------------------------------
 
     def _round_trip(self, trip: RoundTrip, out: list[Decoded]) -> None:
-        """Append the echo for a comparison of the clocks."""
+        """Append the `ClockEcho` of a comparison of the clocks."""
         if not abs(trip.remote_s) < _LATEST_S or trip.received_ns < trip.sent_ns:
             self.suspicious += 1
             return

@@ -50,7 +50,7 @@ _MOST_SAMPLES = 256
 _BUFFER_S = 10
 """Duration of the samples that the library stores while this host does not read, s."""
 _OTHERS = 32
-"""Number of streams after which the search for all streams, fitting or not, ends."""
+"""Number of streams after which the search for all streams ends. An error message lists them."""
 _LISTED = 8
 """Largest number of streams in an error message."""
 _FORMATS = dict(enumerate(("", "float32", "double64", "string", "int32", "int16", "int8", "int64")))

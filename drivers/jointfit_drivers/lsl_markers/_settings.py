@@ -99,7 +99,8 @@ class LslMarkersSettings(MocapSettings):
                 mark = '"' if "'" in text else "'"
                 parts.append(f"{key}={mark}{text}{mark}")
         if not parts:
-            # Qualisys uses the type Mocap; the convention and the project's own outlet use MoCap.
+            # Qualisys uses the type Mocap. XDF's meta-data and the LSL outlet of this project use
+            # MoCap.
             parts = [
                 "translate(type,'MOCAP','mocap')='mocap'",
                 "not(starts-with(source_id,'jointfit-'))",

@@ -50,7 +50,8 @@ _FIELD = int(SensorField.MAGNETIC_FIELD)
 _DATA = 0x80
 """Lowest descriptor set with data. Lower descriptor sets contain commands."""
 _FOREIGN = 20
-"""Number of consecutive orientations of the other data set that causes a warning."""
+"""Number of consecutive orientations in a data set that is not configured, after which a warning is
+returned."""
 _REPORT_NS = 10_000_000_000
 """Shortest time between two reports of invalid orientations, ns."""
 _NEWEST = NewestKnown((1,), "SensorConnect")
@@ -63,7 +64,8 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
     Parameters
     ----------
     baud : int, optional
-        Line speed, bit/s, for back-dating of stamps; None for USB.
+        Line speed, bit/s, from which the arrival of the first byte of a message is computed; None
+        for USB.
     required : RequiredFields
         Data set and fields that the device must send.
     make_raw : callable, optional
@@ -139,7 +141,7 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
         self, packet: MipPacket, values: dict[int, tuple[Any, ...]]
     ) -> list[Decoded]:
         """Return the samples that the decoded fields of one packet contain."""
-        if not self._needed <= values.keys():  # some fields have another decimation
+        if not self._needed <= values.keys():  # with different decimations, a packet lacks fields
             return []
 
         self._foreign = 0
@@ -191,7 +193,7 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
         return [DeviceEvent("warning", text)]
 
     def _note_other_set(self, packet: MipPacket) -> list[Decoded]:
-        """Return a warning about an unknown data set, or orientations of the other data set."""
+        """Return a warning about an unknown data set, or about orientations in a set not in use."""
         if known_fields(packet.descriptor_set) is None:
             return self._take_unknown("packets", packet)
         field = self._other.get(packet.descriptor_set)

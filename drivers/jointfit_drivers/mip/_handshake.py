@@ -80,7 +80,7 @@ class MipHandshake:
         DeviceLostError
             The device does not answer, was unplugged, or stopped answering.
         DeviceMisconfiguredError
-            The device uses another speed, is of another kind, or cannot send the orientation at
+            The device uses another speed, is not a MIP device, or cannot send the orientation at
             this rate.
         """
         settings = self._settings

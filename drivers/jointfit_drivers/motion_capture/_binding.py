@@ -2,12 +2,13 @@
 
 The plain marker name (``T1``) is sufficient if only one model has a marker with that name. The
 names of model and marker together are always possible: ``Thigh/T1``, ``Thigh:T1``, ``Thigh_T1``, or
-``Thigh_1`` with the number of the marker. The same applies to bones, and to bodies inside an asset.
+``Thigh_1`` with the number of the marker. The same applies to bones, and to bodies inside an asset
+(an object of OptiTrack Motive that contains markers and rigid bodies).
 A column gets the name that rig.toml uses for it. Other columns get the plain name if it is unique,
 and ``Thigh/T1`` if it is not.
 
 Invariant: the functions are pure. A plain name, or a name with its model, selects the same marker
-whatever its id and the order of the models; ``Thigh_1`` depends on the order of the markers in the
+whatever its id and the order of the models. ``Thigh_1`` depends on the order of the markers in the
 model. The time is proportional to the size of the model. The number of columns is limited, because
 the model in one datagram can contain 65 000 markers.
 """
@@ -33,7 +34,7 @@ ColumnKey = int | tuple[str, int]
 
 _MOST_COLUMNS = 2000
 """Largest number of columns in addition to those named in rig.toml. Further columns are dropped,
-because each column takes time in every frame, and no camera system labels as many markers."""
+because each column takes time in every frame, and no camera system labels that many markers."""
 MOST_NAMED = 50
 """Largest number of server names in a warning."""
 _MOST_COMPARED = 500
@@ -41,7 +42,8 @@ _MOST_COMPARED = 500
 _MOST_SUGGESTED = 3
 """Largest number of misspelled names for which a similar name is suggested."""
 _MOST_LISTED = 200
-"""Largest number of names of markers or bodies in one event. The count in its text is exact."""
+"""Largest number of names of markers or bodies in one event. The text of the event contains the
+exact count."""
 
 
 class ModelEntry(NamedTuple):

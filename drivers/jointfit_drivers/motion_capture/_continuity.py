@@ -25,8 +25,13 @@ class FrameStep(NamedTuple):
     """Classification of one frame."""
 
     use: bool = True
+    """Whether the frame is used. A repeated or late frame is not used."""
+
     lost: int = 0
+    """Number of frames lost before this frame."""
+
     restarted: bool = False
+    """Whether the server or its recording restarted before this frame."""
 
 
 _NEXT, _DROP, _RESTART = FrameStep(), FrameStep(use=False), FrameStep(restarted=True)

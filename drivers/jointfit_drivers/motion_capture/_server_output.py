@@ -12,9 +12,9 @@ if TYPE_CHECKING:
 class ServerOutput:
     """Emits the chunks of a server, across all connections of a driver.
 
-    If the frames have stopped, or if the previous connection received answers but no frame, answers
-    are emitted only with the next frame. Otherwise a server that sends only answers would be
-    reported as lost again at every connection.
+    An answer is a chunk without a frame. If the frames have stopped, or if the previous connection
+    received answers but no frame, answers are emitted only with the next frame. Otherwise a server
+    that sends only answers would be reported as lost again at every connection.
     """
 
     def __init__(self) -> None:

@@ -31,7 +31,7 @@ ABSENT = (NO_POSITION, NO_ORIENTATION)
 NORM_TOLERANCE = 1e-3
 """Largest deviation of a quaternion's norm from 1."""
 FARTHEST_M = 10_000.0
-"""Largest plausible coordinate, m. A comparison with it must also reject NaN."""
+"""Largest plausible coordinate, m. A comparison with this value must also reject NaN."""
 _MATRIX_TOLERANCE = 1e-2
 """Largest row sum of the absolute elements of RᵀR - I."""
 _LEAST_DETERMINANT = 0.5
@@ -124,5 +124,6 @@ _WORLDS: dict[str, tuple[Place, Turn]] = {
     "-z": (lambda x, y, z: (x, -y, -z), lambda w, x, y, z: (-x, w, -z, y)),
 }
 """Rotation of the world that makes z up, for each up axis: 90° about y or x, or 180° about x. The
-rotation is applied to positions, and multiplied from the left to quaternions.
+first function rotates a position. The second function multiplies a quaternion by the rotation from
+the left.
 """

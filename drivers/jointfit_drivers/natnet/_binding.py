@@ -9,9 +9,9 @@ are identified by set and position. The set ``all`` is ignored, because it repea
 
 `jointfit_drivers.motion_capture.bind_columns` defines the names of the columns.
 
-Invariant: the module is pure. A name of a rigid body, or of a marker whose description contains its
-name, selects the same column when the server assigns other ids or lists its models in another
-order.
+Invariant: the module is pure. The name of a rigid body selects the same column when the server
+assigns other ids or lists its models in another order. The same applies to a marker whose name is
+in the description.
 """
 
 from __future__ import annotations

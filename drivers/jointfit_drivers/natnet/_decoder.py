@@ -1,5 +1,8 @@
 """Decoder of NatNet servers: converts datagrams to optical frames and clock echoes.
 
+An echo is the server's reply to an echo request. The reply contains the sending time of the request
+and the server's time, and thus relates the two clocks.
+
 A network capture contains datagrams in both directions. Datagrams from a client have one effect:
 the arrival of an echo request is used as the sending time of the request. A frame that arrives
 before the model is dropped and counted in `unpublished`. Every number is checked against its range

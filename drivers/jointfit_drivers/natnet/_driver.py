@@ -43,8 +43,8 @@ class NatNetMocap:
         Raises
         ------
         DeviceLostError
-            The host is unknown, does not answer, or has no listening server, or the server sends no
-            frame for ``silence_s`` or was replaced by another server. A retry may succeed.
+            The host is unknown, does not answer, or has no listening server. Or the server sends no
+            frame for ``silence_s``, or was replaced by another server. A retry may succeed.
         DeviceMisconfiguredError
             The host is not a NatNet server, its bitstream is not supported, or the network card
             does not exist.

@@ -31,9 +31,9 @@ _LONGEST_VERSION = len("99.99")
 def connect_request(settings: NatNetSettings) -> Connect:
     """Return the CONNECT message to send, in a form that real servers answer.
 
-    If the settings name a bitstream version, which clients of unicast 4.x servers can select, the
-    message has the form of the vendor's sample program (271 bytes). Otherwise it has the form of
-    the vendor's library NatNetLib 3 (264 bytes).
+    Clients of unicast 4.x servers can select a bitstream version. If the settings name a version,
+    the message has the form of the vendor's sample program (271 bytes). Otherwise it has the form
+    of the vendor's library NatNetLib 3 (264 bytes).
     """
     wanted = settings.wanted_version
     if wanted is None:

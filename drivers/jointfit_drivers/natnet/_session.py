@@ -57,8 +57,8 @@ MODEL_S = 5.0
 """Longest wait for MODELDEF, s."""
 FIRST_ECHOES, FIRST_ECHO_S = 10, 0.05
 ECHO_S = (0.8, 1.2)
-"""Range of the interval between echoes, s. The interval is random, so that echoes do not
-synchronize with the frame rate."""
+"""Range of the interval between echo requests, s. The interval is random, so that the requests have
+no fixed phase relative to the frames."""
 EVERY_S = 1.0
 """Interval between keep-alive messages, between requests for a changed model, and between checks of
 a whole frame, s."""

@@ -1,8 +1,9 @@
 """A timer that detects the silence of one device.
 
-Invariant: an arrival costs only one reading of the clock. Only the first arrival may restart the
-event loop's timer, if `first_s` is longer than `silence_s`. If the event loop's timer ends before
-the permitted silence is over, it is restarted for the remaining time.
+Invariant: an arrival costs only one reading of the clock. The first arrival restarts the event
+loop's timer if `first_s` is longer than `silence_s`. No later arrival restarts the timer. If the
+event loop's timer ends before the permitted silence is over, it is restarted for the remaining
+time.
 """
 
 from __future__ import annotations

@@ -40,8 +40,8 @@ class WallClock:
         self._offset_ns = self._before_ns = self._difference()
         self._stepped_ns = monotonic_ns() - OLDEST_NS
         self.replaced = 0
-        """Number of stamps replaced by the time of the read, because no difference explained
-        them."""
+        """Number of packets that got the time of the read, because the kernel's stamp was missing
+        or did not correspond to an instant in the recent past."""
 
     def pair(self) -> int:
         """Measure the difference between the clocks; return the monotonic time, ns."""

@@ -140,7 +140,10 @@ class SharedBus:
                 self._backend = backend
 
     async def leave(self) -> None:
-        """Unregister a user. The last user closes the bus, or the first user if the bus failed."""
+        """Unregister a user. The last user closes the bus.
+
+        If the bus has failed, the first user that leaves closes it.
+        """
         self.users -= 1
         async with self._lock:
             if self.users and self._failed is None:
@@ -236,7 +239,7 @@ class SharedBus:
             self._subscribers.remove(subscriber)
             self._route()
             if ended.done() and not ended.cancelled():
-                ended.exception()  # marks the error as retrieved, in case of a cancellation
+                ended.exception()  # otherwise asyncio logs it after a cancellation
 
     def _explain_silence(
         self,

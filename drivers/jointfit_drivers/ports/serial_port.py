@@ -187,7 +187,7 @@ class SerialPort:
                 timer.cancel()
             loop.remove_reader(self._fd)
             if ended.done() and not ended.cancelled():
-                ended.exception()  # marks the error as retrieved, in case of a cancellation
+                ended.exception()  # otherwise asyncio logs it after a cancellation
 
     async def receive(self, timeout_s: float) -> Chunk | None:
         """Return the next chunk; None if no byte arrives within `timeout_s` seconds.

@@ -36,7 +36,8 @@ class SerialTableDecoder(SerialMessageDecoder[TableMessage]):
     form : SampleForm
         Meaning of the numbers in the messages.
     baud : int, optional
-        Line speed, bit/s, for back-dating of stamps; None for USB.
+        Line speed, bit/s, from which the arrival of the first byte of a message is computed; None
+        for USB.
     """
 
     def __init__(self, wire: FrameFormat | LineFormat, form: SampleForm, baud: int | None) -> None:

@@ -1,4 +1,6 @@
-"""Description of the differences between received bytes and the table, with the remedy.
+"""Differences between the received bytes and the table in rig.toml that describes them.
+
+Each difference is described in an error message with its remedy.
 
 Invariant: the functions are pure, and return a text for every input.
 """
@@ -114,7 +116,7 @@ def _explain_frames(data: bytes, wire: FrameFormat) -> str:
 
 
 def _end_finding(frames: Sequence[bytes], wire: FrameFormat) -> str | None:
-    """Return that frames of equal length do not end as expected; None if they do."""
+    """Return the finding that frames of equal length lack their `end`; None if they have it."""
     if sum(frame.endswith(wire.end) for frame in frames) >= _SHARE * len(frames):
         return None
     end = wire.end.hex(" ").upper()

@@ -1,13 +1,13 @@
 """Time and counter of a device that a table describes: losses, restarts, and corrupt values.
 
-In the table, d is the step of device time, c is the step of the counter (modulo its width), and P
-is the measured sample period:
+In the table, d is the step of device time, c is the step of the counter (modulo the number of its
+values), and P is the measured sample period:
 
 | finding                                                  | outcome                          |
 |----------------------------------------------------------|----------------------------------|
 | c = round(d / P) within 1 % and two counts               | same clock; c - 1 samples lost   |
-| no counter; d is not negative, and is short or equal to  | same clock; round(d / P) - 1     |
-| the step of the arrival times                            | samples lost                     |
+| no counter; d is not negative, and is at most 100 P or   | same clock; round(d / P) - 1     |
+| about equal to the step of the arrival times             | samples lost                     |
 | no time; c is not negative, and fits the arrival times   | c - 1 samples lost               |
 | none of the above                                        | the sample is held for the next  |
 | the next sample continues the held one                   | the device restarted             |
@@ -39,7 +39,7 @@ _FASTER = 4.0
 
 
 class RecordStep(NamedTuple):
-    """Classification of one sample."""
+    """Classification of one sample. A *held* sample waits for the next sample to confirm it."""
 
     lost: int = 0
     """Number of samples lost before this sample; 0 if the held sample is confirmed."""

@@ -34,7 +34,8 @@ _TIMED = 200
 _TIMED_NS = 2_000_000_000
 """Shortest time between arrivals over which the unit of device time is checked, ns."""
 _FASTEST = 1.5
-"""Largest ratio of device time to host time, or its inverse, with a correct unit."""
+"""Largest factor between elapsed device time and elapsed host time, in either direction, with a
+correct unit."""
 
 _Sample = tuple[tuple[bytes, ...], tuple[float, ...], tuple[float, ...]]
 

@@ -73,7 +73,8 @@ class VectorNavDecoder(SerialMessageDecoder[VectorNavMessage]):
     Parameters
     ----------
     baud : int, optional
-        Line speed, bit/s, for back-dating of stamps; None for USB.
+        Line speed, bit/s, from which the arrival of the first byte of a message is computed; None
+        for USB.
     world_to_sensor : bool
         Whether the quaternion converts world to sensor coordinates.
     make_raw : callable, optional
@@ -102,7 +103,7 @@ class VectorNavDecoder(SerialMessageDecoder[VectorNavMessage]):
         self._rate_check = None if rate_hz is None else RateCheck(rate_hz)
         self._register = Register.BINARY_OUTPUT + output - 1
         self._newer = NewerFirmwareDetector(_NEWEST)
-        self._places: dict[bytes, _Places] = {}  # by header; a device sends up to three kinds
+        self._places: dict[bytes, _Places] = {}  # by header; a device has three outputs
 
     @override
     def _take(self, message: VectorNavMessage) -> list[Decoded]:

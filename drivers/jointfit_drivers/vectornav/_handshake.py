@@ -1,10 +1,10 @@
 """Start of a VectorNav device: the driver makes it stream, or raises an error with the cause.
 
-The driver reads registers, and writes only registers that differ. Written values are volatile:
-without ``persist``, the device returns to its stored values at the next power-up. A fault that may
-end without a change of the settings raises `DeviceLostError`. All other faults raise
-`DeviceMisconfiguredError`. Before it raises this error, the driver requests the device to resume.
-Registers that were already written keep their new values until the next power-up.
+The driver reads registers, and writes only registers that differ from rig.toml. Written values are
+volatile: without ``persist``, the device returns to its stored values at the next power-up. A fault
+that may end without a change of the settings raises `DeviceLostError`. All other faults raise
+`DeviceMisconfiguredError`. Before it raises this error, the driver requests the device to resume
+its stream. Registers that were already written keep their new values until the next power-up.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ _REPLY_S, _STORE_S = 0.5, 3.0
 """Longest wait for a reply, and until all registers are stored, s."""
 _IMU_RATES = {"VN-3": 400}
 _IMU_RATE = 800
-"""Rates of the IMU, Hz: for models whose name contains a key of the table, and for others."""
+"""Internal rates of the IMU, Hz: of models whose name contains a key of `_IMU_RATES`, and of all
+other models."""
 
 
 class VectorNavHandshake:
@@ -78,8 +79,8 @@ class VectorNavHandshake:
         DeviceLostError
             The device does not answer, was unplugged, or stopped answering.
         DeviceMisconfiguredError
-            The device uses another speed, is of another kind, or cannot send the orientation at
-            this rate.
+            The device uses another speed, is not a VectorNav device, or cannot send the orientation
+            at this rate.
         """
         settings = self._settings
         settings.require_line_speed()
@@ -105,7 +106,7 @@ class VectorNavHandshake:
         self._refuse(await self._answer("VNASY,1"), "refuses to stream")
 
     async def _configure(self) -> None:
-        """Write the registers that differ; the device must be paused."""
+        """Write the registers that differ from rig.toml; the device must be paused."""
         model = await self._answer(f"VNRRG,{Register.MODEL}")
         if model.error is None and len(model.values) > 1:
             self._model = model.values[1]

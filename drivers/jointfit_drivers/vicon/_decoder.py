@@ -1,7 +1,9 @@
 """Decoder of Vicon DataStream servers: converts packets to optical frames.
 
-Every chunk is one packet. Device time is the number of the camera frame times the frame period. The
-announced delay is subtracted from the arrivals.
+Every chunk is one packet, which consists of objects. Static objects describe the scene, such as its
+subjects and the frame period. Dynamic objects contain the data of one frame. Device time is the
+number of the camera frame times the frame period. The delay that the server announces is subtracted
+from the arrivals.
 
 Invariant: the output depends only on the chunks fed. The decoder reads no clock and no socket.
 """

@@ -1,8 +1,9 @@
 """Conversion of the objects of one Vicon frame to columns: SI units, world z up, NaN if missing.
 
 A subject that is not visible has no object. Positions are in millimetres, and rotation matrices in
-row-major order. If there are no global poses, the light-weight poses are used. They are relative to
-the parent segment, so a segment whose parent is not visible counts as missing.
+row-major order. Global poses are relative to the world. If there are none, light-weight poses are
+used. They are relative to the parent segment, so a segment whose parent is not visible counts as
+missing.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ if TYPE_CHECKING:
     Pose = tuple[Vector, Quaternion]
 
 _WIDEST = 2 * math.pi
-"""Largest plausible component of a rotation vector, rad. Comparisons treat NaN as larger."""
+"""Largest plausible component of a rotation vector, rad. A comparison with this value must also
+reject NaN."""
 _DEEPEST = 200
 """Largest number of segments from a root to an end. A longer chain contains a loop."""
 

@@ -1,9 +1,10 @@
 """Current objects of a Vicon DataStream after each packet.
 
-Static and dynamic objects form two separate sets. A packet without static objects does not change
-the static set. Otherwise the new static set consists of the objects in the packet, and of the types
-that the object ``Contents`` lists as unchanged. The dynamic set is updated in the same way. A type
-that is neither present nor unchanged is not visible.
+A packet consists of objects. Static objects describe the scene, such as its subjects. Dynamic
+objects contain the data of one frame. Static and dynamic objects form two separate sets. A packet
+without static objects does not change the static set. Otherwise the new static set consists of the
+objects in the packet, and of the types that the object ``Contents`` lists as unchanged. The dynamic
+set is updated in the same way. A type that is neither present nor unchanged is not visible.
 
 Invariant: the module is pure.
 """

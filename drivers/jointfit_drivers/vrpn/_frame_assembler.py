@@ -21,7 +21,7 @@ _LEAST_AWAITED_US = 100_000
 """Shortest time for which a body without reports is still expected, µs."""
 _AWAITED_PERIODS = 3
 _SAME_FRAME = 0.5
-"""Largest difference between the times in one frame, periods."""
+"""Largest difference between the times in one frame, in periods."""
 _FIRST_SPREAD_US = 2_000.0
 """Largest difference between the times in one frame while the period is unknown, µs."""
 _LONGEST_US = 500_000

@@ -2,7 +2,8 @@
 
 1. The session opens a TCP connection to the server. With ``connection = "classic"``, it announces
    itself by UDP twice, 2 s apart, and the server connects back.
-2. Both sides send a cookie that contains their version. Other major versions are refused.
+2. Both sides send a cookie that contains their version. The session refuses a server whose major
+   version differs from its own.
 3. With ``transport = "udp"``, the session sends the UDP port for poses.
 4. Poses follow. After half of `silence_s` without a pose, the session sends pings, at
    intervals of at most 1 s. The error message can then name the cause: no server, or no visible

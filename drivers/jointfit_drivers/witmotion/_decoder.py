@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 _CHECKED_FRAMES = 100
 """Number of frames after which missing kinds are reported. They contain at least ten samples."""
 _OTHER_FRAMES = 3
-"""Number of frames with the start bytes 55 61 that identify this variant of devices. Noise may
-contain one such frame by chance."""
+"""Number of frames with the start bytes 55 61 that prove that the device is a variant without
+quaternions. Noise may contain one such frame by chance."""
 _MOST_COUNT = 32_700
 """Smallest absolute count of an acceleration or rate that is out of range."""
 _SCALE = 1.0 / FULL_SCALE
@@ -64,7 +64,8 @@ class WitMotionDecoder:
     Parameters
     ----------
     baud : int, optional
-        Line speed, bit/s, for back-dating of stamps; None for USB.
+        Line speed, bit/s, from which the arrival of the first byte of a frame is computed; None
+        for USB.
     world : World
         World of the quaternion that the device sends.
     inverse : bool

@@ -100,7 +100,7 @@ class WitMotionHandshake:
         DeviceLostError
             The device is silent or unplugged, or stopped sending after its settings were written.
         DeviceMisconfiguredError
-            The device uses another speed, is of another kind or variant, or does not send the
+            The device uses another speed, is not a supported WitMotion device, or does not send the
             frames even on request.
         """
         settings = self._settings

@@ -2,8 +2,8 @@
 
 An orientation *follows* another orientation if counter and device time advanced together. If only
 one of them is sent, it must have advanced by at most a few periods. Every MTData2 message
-increments the counter. Only messages with an orientation are compared, because others may contain
-the time of another clock (GNSS).
+increments the counter. Only messages with an orientation are compared, because other messages may
+contain the time of another clock (GNSS).
 
 | orientation                                   | outcome                                         |
 |-----------------------------------------------|-------------------------------------------------|
@@ -32,7 +32,8 @@ from jointfit_protocols.xbus.configuration import TICK_NS, WRAP_32_BIT, WRAP_DAY
 
 _COUNTS = 1 << 16
 _GAP = 1.5
-"""Longest time between two messages for which a jump of the counter alone is accepted, periods."""
+"""Longest time between two messages at which a jump of the counter alone is accepted, in
+periods."""
 _PLAUSIBLE_GAP = 3600 * 1_000_000_000 // TICK_NS
 """Longest plausible gap, ticks. One hour is longer than any delay or buffer."""
 _SLACK_COUNTS = 4

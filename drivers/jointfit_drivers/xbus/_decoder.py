@@ -90,7 +90,8 @@ class XbusDecoder:
     Parameters
     ----------
     baud : int, optional
-        Line speed, bit/s, for back-dating of stamps; None for USB.
+        Line speed, bit/s, from which the arrival of the first byte of a message is computed; None
+        for USB.
     rate_hz : float
         Nominal rate, Hz. It is used until the rate of the stream is measured.
     wires : mapping, optional
@@ -169,7 +170,7 @@ class XbusDecoder:
         return out + self._take(found) if found else out
 
     def flush(self) -> list[Decoded]:
-        """Discard an incomplete message, and an orientation that waits for confirmation."""
+        """Discard an incomplete message, and an orientation that no later message has confirmed."""
         return self._take(self._xbus.flush()) + self._drop_held()
 
     def _take(self, found: list[XbusMessage | CorruptBytes]) -> list[Decoded]:

@@ -34,8 +34,8 @@ LINE_SPEEDS = (921_600, 115_200, 460_800, 230_400, 2_000_000, 57_600, 38_400, 19
 _LISTEN_S = 0.15
 """Duration of the search at each speed, s. An acknowledgement takes 10 ms at 9600 baud."""
 _QUIET_S = 1.2
-"""Time without a byte after which the earlier bytes count as noise, s. Devices of other kinds may
-send only once a second."""
+"""Time without a byte after which the earlier bytes count as noise, s. It is longer than one
+second, because a device that is not an Xbus device may send only once a second."""
 _RESETS, _RESET_WAIT_S = 50, 0.1
 """Number of requests after a reset, and the interval between them, s. An MTi-G-700 that had not
 answered before replied 1.8 s after its reset."""
@@ -44,8 +44,8 @@ _FRAMES = (0, 1)
 _UNKNOWN_MESSAGE = b"\x04"
 """Error code that a device sends for an unknown message."""
 _RATE_SHARE = 0.01
-"""Largest accepted relative difference between the rate of an older device and `rate_hz`. The
-device rounds its sample period."""
+"""Largest accepted relative difference between `rate_hz` and the rate of an older device (a device
+that sends MTData). Such a device rounds its sample period."""
 _NO_SYNC = bytes(12)
 """Entry for a sync function that is off. A request without data would only read the settings."""
 
@@ -84,8 +84,8 @@ class XbusHandshake:
         DeviceLostError
             The device does not answer, was unplugged, or stopped answering.
         DeviceMisconfiguredError
-            The device uses another speed or is of another kind. Or the output configuration differs
-            and must not be written.
+            The device uses another speed or is not an Xbus device. Or the output configuration
+            differs and must not be written.
         """
         settings = self._settings
         settings.require_line_speed()

@@ -1,8 +1,8 @@
 """Counter and time of an XCDI sensor: lost groups, restarts, and shared identifiers.
 
 A group consists of the CAN frames of one sample. In the table, d and c are the steps of SampleTime
-and GroupCounter since the previous group, both modulo their widths. P is the measured step of
-SampleTime per group:
+and GroupCounter since the previous group, each modulo its number of values. P is the measured step
+of SampleTime per group:
 
 | finding                                                 | outcome                             |
 |---------------------------------------------------------|-------------------------------------|
@@ -18,7 +18,8 @@ SampleTime per group:
 
 The serial line of a CAN adapter has no checksum, so a single group does not prove a restart. A
 sensor that is reset contradicts the previous groups once. Two sensors with the same identifiers
-contradict each other continuously. Their groups cannot be separated, so no group is used.
+contradict each other continuously. Their groups cannot be separated, so no group is used. A group
+is *broken* if it or the group before it lacks a frame.
 
 Invariant: the result depends only on the values fed, and every input is accepted.
 """
@@ -37,7 +38,7 @@ _LEARNED = 10
 _SLACK_COUNTS = 2
 _NEAR = 10
 """Largest difference between the steps of counter and time that counts as corruption, not as a
-jump, groups."""
+jump, in groups."""
 _SLACK_SHARE = 0.01
 _SILENT = _NEAR + 1
 """Shortest silence over which SampleTime is compared with host time, groups."""

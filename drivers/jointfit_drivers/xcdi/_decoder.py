@@ -102,7 +102,7 @@ class XcdiDecoder:
         return out
 
     def flush(self) -> list[Decoded]:
-        """Discard an incomplete group, and a group that waits for confirmation."""
+        """Discard an incomplete group, and a group that no later group has confirmed."""
         self._xcdi.flush()
         out: list[Decoded] = []
         self._drop_held(out)

@@ -6,8 +6,8 @@ t0, t1 and t2. Their deviation from a uniform motion, as an angle in rad, is
 
     E = 2 |q2 - q1 - (q1 - q0) (t2 - t1) / (t1 - t0)|.
 
-The limit for E is twice the largest E of the last seconds, so an acceleration of the sensor raises
-the limit.
+For two successive messages, the limit for E is 0.005 rad plus twice the largest E of the last
+seconds. An acceleration of the sensor therefore raises the limit.
 
 | message                                       | outcome                                          |
 |-----------------------------------------------|--------------------------------------------------|
@@ -39,7 +39,7 @@ _FIRST_US = 1_000_000
 """Longest step of device time to the next message while the period is unknown, us. It permits a
 device at 1 Hz."""
 _EXTRAPOLATED = 2.5
-"""Longest interval over which motion is extrapolated, periods."""
+"""Longest interval over which motion is extrapolated, in periods."""
 _STEADY = 0.005
 """Deviation from a uniform motion that is always accepted, rad."""
 _DECAY = 0.998
@@ -54,7 +54,7 @@ is the shortest interval."""
 _LONGER = 20
 """Number of consecutive intervals with the same number of periods that prove a changed rate."""
 _MOST_COUNTED = 50
-"""Longest interval that contributes to the mean, periods."""
+"""Longest interval that contributes to the mean, in periods."""
 _PACE_NS = 250_000_000
 """Largest difference between elapsed device time and elapsed arrival time without a restart or a
 backlog, ns."""

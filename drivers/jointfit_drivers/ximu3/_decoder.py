@@ -98,7 +98,7 @@ class XImu3Decoder(SerialMessageDecoder[XImu3Data | XImu3Reply]):
 
     @override
     def flush(self) -> list[Decoded]:
-        """Discard an incomplete message, and a measurement that waits for confirmation."""
+        """Discard an incomplete message, and a measurement that no later message has confirmed."""
         return super().flush() + self._drop_held()
 
     @override

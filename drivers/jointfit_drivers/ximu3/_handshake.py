@@ -70,7 +70,7 @@ class XImu3Handshake:
         DeviceLostError
             The device does not answer, was unplugged, or stopped answering.
         DeviceMisconfiguredError
-            The device uses another speed or is of another kind. Or its settings differ and must not
+            The device uses another speed or is not an x-IMU3. Or its settings differ and must not
             be written.
         """
         settings = self._settings

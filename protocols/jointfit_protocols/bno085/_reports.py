@@ -14,9 +14,9 @@
 A sensor report begins with four fields: id, sequence, status and delay. Bits 0..1 of the status are
 the accuracy, and bits 2..7 are the high bits of the delay. A packet begins with report FB, which
 contains the time from a reference instant, the base, to the transmission of the packet. The delay
-is the time from the base to the measurement. Both times are in units of 100 us. The report FA
-shifts the base. Gyro rotation vectors are sent on a separate channel and consist only of their
-values.
+is the time from the base to the measurement. The delay and the times in FA and FB are in units of
+100 us. The report FA shifts the base. Gyro rotation vectors are sent on a separate channel and
+consist only of their values.
 
 Sources: SH-2 reference manual 1000-3625. Lengths and the sign of times are from the vendor's host
 library (sh2, Apache-2.0).
@@ -80,7 +80,8 @@ _SCALES: dict[int, tuple[float, ...]] = {
     HubReportId.GAME_ROTATION_VECTOR: (_Q14,) * 4,
     HubReportId.ARVR_GAME_ROTATION_VECTOR: (_Q14,) * 4,
 }
-"""Value of one count, for each field of each report, in the units of the table above."""
+"""Value of one count, for each field of each report, in the units of the table at the top of this
+module."""
 _LENGTHS: dict[int, int] = {
     0x01: 10, 0x02: 10, 0x03: 10, 0x04: 10, 0x05: 14, 0x06: 10, 0x07: 16, 0x08: 12, 0x09: 14,
     0x0A: 8, 0x0B: 8, 0x0C: 6, 0x0D: 6, 0x0E: 6, 0x0F: 16, 0x10: 5, 0x11: 12, 0x12: 6, 0x13: 6,

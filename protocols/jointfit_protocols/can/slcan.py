@@ -12,7 +12,7 @@ followed each other without a pause.
 Every line ends with CR; LF is ignored. A frame may be followed by four digits of adapter time in
 ms, modulo 60 000. The digits are dropped, because they refer to another clock. The adapter answers
 a command with CR (done) or BELL (refused). The commands of the host include ``Sn`` (bit rate),
-``O`` (open), ``C`` (close), ``V``, ``N`` and ``Z``.
+``O`` (open), ``C`` (close), ``V`` (version), ``N`` (serial number) and ``Z`` (adapter time).
 
 Source: Lawicel CAN232 manual, version 3.
 

@@ -3,9 +3,9 @@
      0     1-2   3-4       5-6   7 .. 6+n   7+n, 8+n   9+n   10+n
     | 3A | id  | command | n   | data ... | LRC      | 0D  | 0A  |      n <= 1024
 
-Numbers are little-endian. LRC is the 16-bit sum of identifier, command, n and data. The vendor's
-documents permit two interpretations: the sum of all bytes, or the sum of the 16-bit words of the
-head and the bytes of the data. Both sums are equal if identifier, command and n are below 256.
+Numbers are little-endian. The checksum LRC is the 16-bit sum of id, command, n and data. The
+vendor's documents permit two interpretations: the sum of all bytes, or the sum of the 16-bit words
+of the head and the bytes of the data. Both sums are equal if id, command and n are below 256.
 The codec accepts both, and sends the sum of the bytes.
 
 Source: protocol pages of the vendor's knowledge base; OpenZen (MIT) for the two sums.
@@ -80,7 +80,7 @@ _TERMINATOR = CorruptBytes(1, "terminator is not CR LF")
 _LENGTH = CorruptBytes(1, "length above 1024")
 
 
-def _read_message(buffer: bytes, at: int, base: int) -> LpBusMessage | CorruptBytes | None:  # noqa: PLR0911 - one for each fault
+def _read_message(buffer: bytes, at: int, base: int) -> LpBusMessage | CorruptBytes | None:  # noqa: PLR0911 - one return for each fault
     """Return the message at `at`, the reason why there is none, or None if it is incomplete."""
     if buffer[at] != _START:
         return _NO_START

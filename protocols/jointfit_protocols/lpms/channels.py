@@ -37,7 +37,8 @@ FRAME_BYTES = 8
 HEARTBEAT = 0x700
 """Identifier of the heartbeat of the node 0."""
 TPDO = (0x180, 0x280, 0x380, 0x480)
-"""Identifiers of the frames of the node 0 in CANopen style."""
+"""Identifiers of the frames of the node 0 in CANopen style. TPDO means transmit process data
+object."""
 OPERATIONAL = 5
 """State in the heartbeat of a sensor that sends data."""
 BOOTED = 0

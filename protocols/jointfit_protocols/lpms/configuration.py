@@ -16,11 +16,13 @@ that reads a setting in one generation may write a setting in the other:
 | firmware              | 2F: patch, minor, major            | 15: text                         |
 | 5B                    | device name, text                  | filter mode, U4                  |
 
+U4 is an unsigned integer of 4 bytes.
+
 Settings are lost at power-off unless they are stored: according to the firmware source of 2013, a
 command changes only the memory, not the flash.
 
 Source: the vendor's register headers (OpenMAT), protocol pages and firmware source of 2013. The
-command 5B was not tested on hardware; both headers list it as a read command.
+command 5B was not tested on hardware; the headers of both generations list it as a read command.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
     | tick U4 | value ... |      each value float32, or int16
 
-The packet does not state which outputs it contains. The output mask, which is read from the device,
-determines the order of the values. The length of the packet shows whether the values have 32 or 16
-bits.
+U4 is an unsigned integer of 4 bytes. The packet does not state which outputs it contains. The
+output mask is read from the device and determines the order of the values. The length of the packet
+shows whether the values have 32 or 16 bits.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
 """Conversion of the chunks of one LSL stream to messages, and of messages to chunks.
 
-A chunk consists of the number of length bytes (1, 4 or 8), the length, a 16-bit tag and the
-content, all little-endian (https://github.com/sccn/xdf/wiki/Specifications). Tag 2 is the
-description of the stream, and tag 3 contains samples. XDF stores the result of a clock comparison
-without its uncertainty. `RoundTrip` therefore also contains the times of request and reply, which
-bound the error, and has a separate tag, which XDF readers skip.
+The chunks have the format of XDF, the file format of LSL
+(https://github.com/sccn/xdf/wiki/Specifications). A chunk consists of the number of length bytes
+(1, 4 or 8), the length, a 16-bit tag and the content, all little-endian. Tag 2 is the description
+of the stream, and tag 3 contains samples. XDF stores the result of a clock comparison without its
+uncertainty. `RoundTrip` therefore also contains the times of request and reply, which bound the
+error, and has a separate tag, which XDF readers skip.
 
 Invariant: `LslCodec.feed` never raises. Each call receives a datagram of complete chunks. If a
 length or count does not agree with the bytes, the rest of the datagram is discarded.

@@ -12,7 +12,9 @@ The two families of devices use different commands for the same settings:
 | format    | 0C,0F: fn, set, n, list -> 8F | 0C,08: fn, n, list -> 80 | 0C,0A: fn, n, list -> 82 |
 | stream    | 0C,11: fn, set, on -> 85      | selector 1               | selector 3               |
 
-An entry of a list in the table is ``field U1 | decimation U2``.
+In the table, ``set`` is a descriptor set, ``fn`` is the function, and ``n`` is the number of
+entries in the list. The command is before the arrow, and its reply is after the arrow. An entry of
+the list is ``field U1 | decimation U2``. U1 and U2 are unsigned integers of 1 and 2 bytes.
 
 Source: definitions of the vendor's mip_sdk (MIT).
 """

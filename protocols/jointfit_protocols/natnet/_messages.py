@@ -1,4 +1,4 @@
-"""NatNet messages on UDP: connection, description of the server, clock echoes.
+"""NatNet messages on UDP: connection, description of the server, and echoes that compare clocks.
 
     | u16 id | u16 payload length | payload |      little-endian; length = size of the datagram - 4
 

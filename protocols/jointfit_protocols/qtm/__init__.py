@@ -1,4 +1,4 @@
-"""Codec of the real-time protocol of Qualisys QTM, versions 1.19 to 1.28, little-endian."""
+"""Codec of the real-time protocol of Qualisys QTM, versions 1.19 to 1.25, little-endian."""
 
 from jointfit_protocols.qtm._components import (
     ITEM_LAYOUTS,

@@ -1,4 +1,4 @@
-"""Checksums of frames, which parameters describe: sums, XOR, Fletcher and CRC.
+"""Checksums of frames, described by parameters: sums, XOR, Fletcher and CRC.
 
 | kind       | value                                                                       |
 |------------|-----------------------------------------------------------------------------|

@@ -65,8 +65,8 @@ _ALONE = CorruptBytes(1, "no frame follows, and frames have no checksum")
 class FrameCodec(ResynchronizingCodec[TableMessage]):
     """Codec that converts byte strings of any size to records; it never raises.
 
-    A run of bytes without a frame becomes one `CorruptBytes`. `feed` does not return frames of
-    other types.
+    A run of bytes without a frame becomes one `CorruptBytes`. `feed` returns only frames with
+    measurements.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ class FrameCodec(ResynchronizingCodec[TableMessage]):
         self._in_step_at = -1  # bytes fed up to and including the previous frame
         self._is_final = False  # whether no further bytes can decide about a frame
         self.skipped = 0
-        """Number of valid frames of other types so far."""
+        """Number of valid frames without measurements so far."""
 
     @property
     def longest(self) -> int:
@@ -169,7 +169,7 @@ class FrameCodec(ResynchronizingCodec[TableMessage]):
         return None
 
     def _message(self, buffer: bytes, at: int, stop: int, base: int) -> TableMessage | CorruptBytes:
-        """Return the record of a valid frame; it has no data if the frame has another type."""
+        """Return the record of a valid frame. It has no data if the frame has no measurements."""
         size, selects = stop - at, self._selects
         wanted = selects is None or (
             size >= selects.size and selects.read(buffer, at)[0] == self._expected

@@ -2,12 +2,12 @@
 
     | groups U1 | fields of group 1, U2 | fields of group 2, U2 | ... | payload |
 
-Bit k of ``groups`` announces the group k + 1. Bit k in the fields of a group announces the field k
-of this group. The payload contains the announced fields in ascending order, little-endian and
-without padding. Firmware since 2023 extends groups and fields. If bit 7 of the byte of groups is
-set, a second byte announces the groups from 9 on. If bit 15 of a word of fields is set, a second
-word announces the fields from 16 on. This module has no layout for a header with a field of unknown
-or variable size.
+U1 and U2 are unsigned integers of 1 and 2 bytes. Bit k of ``groups`` announces the group k + 1. Bit
+k in the fields of a group announces the field k of this group. The payload contains the announced
+fields in ascending order, little-endian and without padding. Firmware since 2023 extends groups and
+fields. If bit 7 of the byte of groups is set, a second byte announces the groups from 9 on. If bit
+15 of a word of fields is set, a second word announces the fields from 16 on. This module has no
+layout for a header with a field of unknown or variable size.
 
 Sources: VN-100 user manual (UM001), section 5, "binary output messages". The sizes of fields and
 the extensions are from the vendor's programming libraries (MIT; SDK 0.99).

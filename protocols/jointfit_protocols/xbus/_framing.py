@@ -124,7 +124,7 @@ _CHECKSUM = CorruptBytes(1, CHECKSUM)
 _LENGTH = CorruptBytes(1, "length outside 255..2048")
 
 
-def _read_message(buffer: bytes, at: int, base: int) -> XbusMessage | CorruptBytes | None:  # noqa: PLR0911 - one for each fault
+def _read_message(buffer: bytes, at: int, base: int) -> XbusMessage | CorruptBytes | None:  # noqa: PLR0911 - one return for each fault
     """Return the message at `at`, the reason why there is none, or None if it is incomplete."""
     if buffer[at] != PREAMBLE:
         return _NO_START

@@ -6,6 +6,8 @@
     AlignmentRotation         | frame U1: 0 sensor, 1 local | w x y z float32 |
     FirmwareRev               | major | minor | revision | build U4 | scm U4 |
 
+U1, U2 and U4 are unsigned integers of 1, 2 and 4 bytes. Fields without a type have 1 byte.
+
 Source: MT0101P rev. 2020.A.
 """
 

@@ -11,14 +11,17 @@ time. A message is rejected if its length does not match the mode.
 | 0x00000002      | UTC time, 12 bytes                                             |
 | 0x0000000C      | orientation: 0 quaternion, 4 Euler angles, 8 matrix            |
 | 0x00000070      | omits accelerometer (1), gyroscope (2), magnetometer (4)       |
-| 0x00000300      | reals: 0 float32, 1 12.20, 2 16.32, 3 float64                  |
+| 0x00000300      | reals: 0 float32, 1 fixed 12.20, 2 fixed 16.32, 3 float64      |
 | 0x00000C00      | omits the auxiliary inputs                                     |
 | 0x80000000      | the world is NED                                               |
+
+U2 is an unsigned integer of 2 bytes. "Fixed 12.20" is a fixed-point number with 12 bits before and
+20 bits after the point.
 
 Source: legacy part of the MT low-level protocol. Fields and their order agree with the open driver
 ethzasl_xsens_driver, which supports only float32. No recording was available. The sources differ on
 the world without the NED flag. In the manuals of MTi and MTx, x points to magnetic north, y west
-and z up. In that driver, x points east.
+and z up. In ethzasl_xsens_driver, x points east.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
     | DataID U2 | size U1 | size bytes |   repeated; the last item ends exactly with the message
 
-The low four bits of the DataID of a real-valued item define its encoding and its world:
+U1, U2 and U4 are unsigned integers of 1, 2 and 4 bytes, and I2 is a signed integer of 2 bytes. The
+low four bits of the DataID of a real-valued item define its encoding and its world:
 
 | bits 1:0 | encoding                                  | bytes |   | bits 3:2 | world |
 |----------|-------------------------------------------|-------|   |----------|-------|

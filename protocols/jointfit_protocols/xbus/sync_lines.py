@@ -6,7 +6,8 @@ message. The output configuration must contain the item TriggerIn1 or TriggerIn2
 
     | line U1 | polarity U1 | time U4, ticks of SampleTimeFine | frame U2 |
 
-The number of the output line is 7 for the MTi-600 series, and 4 for all other series.
+U1, U2 and U4 are unsigned integers of 1, 2 and 4 bytes. The number of the output line is 7 for the
+MTi-600 series, and 4 for all other series.
 
 Source: MT0101P rev. 2020.A. The layout of the item is from the vendor's public headers. These
 sources do not document the unit of the item's time, which is assumed to be the unit of

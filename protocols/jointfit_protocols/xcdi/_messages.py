@@ -5,7 +5,8 @@ Every quantity is sent in a separate frame. The frames of one sensor at one inst
     SampleTime  GroupCounter  ...  Quaternion        lowest identifier first
     U4 ticks    U2            ...  4 x I2 / 32767, w x y z, sensor to world, ENU
 
-Frames of other sensors may arrive in between, so groups are assembled separately for each sensor.
+U2 and U4 are unsigned integers of 2 and 4 bytes, and I2 is a signed integer of 2 bytes. Frames of
+other sensors may arrive in between, so groups are assembled separately for each sensor.
 Identifiers can be configured. By default, they are the data identifiers, but any 11- or 29-bit
 value is possible.
 
@@ -177,9 +178,10 @@ _GROUP_COUNTER, _ERROR = DataId.GROUP_COUNTER, DataId.ERROR
 class XcdiCodec:
     """Codec that converts one sensor's frames to groups; it never raises.
 
-    SampleTime opens a group, and Quaternion completes it. A second SampleTime or counter before the
-    Quaternion counts as one incomplete group. A Quaternion without an open group has no device
-    time, but it may have a counter. Frames with other identifiers are counted and ignored.
+    SampleTime opens a group, and Quaternion completes it. If a second SampleTime or GroupCounter
+    arrives before the Quaternion, the open group counts as incomplete. A Quaternion without an open
+    group has no device time, but it may have a counter. Frames with other identifiers are counted
+    and ignored.
 
     Parameters
     ----------

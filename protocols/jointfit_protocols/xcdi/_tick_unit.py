@@ -26,7 +26,7 @@ TICK_NS = {"100us": 100_000, "1us": 1_000}
 _STEPS = 10
 """Number of steps after which the unit is determined."""
 _NEAR = 0.5
-"""Largest deviation from 10^4 or 10^6 ticks per second, decades."""
+"""Largest deviation from 10^4 or 10^6 ticks per second, as a difference of decimal logarithms."""
 _SPAN_NS = 1_000_000_000
 """Shortest span of arrivals over which the rate is measured, ns."""
 _CONTRADICTIONS = 2

@@ -32,7 +32,8 @@ _SEARCHED = 256
 numbers is shorter."""
 _MOST_PENDING = MAX_LINE + _SEARCHED
 _NEVER = 1 << 62
-"""Modulus with which -1, the result of a search without a match, exceeds every position."""
+"""Modulus that converts -1, the result of a search without a match, to a number above every
+position."""
 _QUATERNION = (0xD1, 26)
 """First byte and size of a binary message with a quaternion."""
 _SHORTEST_RUN = 4

@@ -5,8 +5,9 @@ r"""Messages of an x-IMU3. Each message is a line that ends with LF.
     Q,<time, us>,<number>,...,<number>\r\n   data in ASCII; the letter is the kind
     D1 | time U8, us | float32 ... | 0A      data in binary; the kind is the letter | 0x80
 
-Numbers are little-endian. In data messages, the bytes 0A and DB before the terminator are sent as
-DB DC and DB DD. There is no checksum. Kind, length and escapes are the only checks.
+U8 is an unsigned integer of 8 bytes. Numbers are little-endian. In data messages, the bytes 0A and
+DB before the terminator are sent as DB DC and DB DD. There is no checksum. Kind, length and escapes
+are the only checks.
 
 Source: x-IMU3-Software of x-io Technologies (MIT), API 1.9.
 """
