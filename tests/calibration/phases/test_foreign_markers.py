@@ -1,4 +1,4 @@
-"""Markers that are on another body part since the static pose refuse the functional phase."""
+"""The functional phase is refused if a marker list contains a marker of another segment."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.calibration import CalibrationSettings
 
+LONG = pytest.mark.experiment
 RIG = bench_rig()
 Lists = dict[str, tuple[str, ...]]
 FOUR_AND_THREE: Lists = {"thigh": ("T1", "T2", "T3", "C4"), "shank": ("C1", "C2", "C3")}
@@ -91,7 +92,11 @@ def test_an_exchange_between_clusters_of_three_markers_is_found() -> None:
 
 @pytest.mark.parametrize(
     ("limb", "tissue_mm"),
-    [("leg", 5.0), ("leg", 10.0), ("legs", 10.0), ("arm", 10.0), ("trunk", 10.0)],
+    [
+        ("leg", 5.0),
+        ("leg", 10.0),
+        *(pytest.param(limb, 10.0, marks=LONG) for limb in ("legs", "arm", "trunk")),
+    ],
 )
 def test_soft_tissue_and_occlusion_are_no_fault(limb: str, tissue_mm: float) -> None:
     phases, rig = trials(limb, tissue_mm), bench_rig(limb=limb)
@@ -127,8 +132,8 @@ def test_a_marker_displaced_since_the_static_pose_is_no_fault() -> None:
     ("lists", "labels", "marker", "part"),
     [
         ({}, ("T1", "C1"), "T1", "thigh"),
-        (FOUR_AND_THREE, (), "C4", "thigh"),
-        (FIVE_AND_THREE, (), "C1", "thigh"),
+        pytest.param(FOUR_AND_THREE, (), "C4", "thigh", marks=LONG),
+        pytest.param(FIVE_AND_THREE, (), "C1", "thigh", marks=LONG),
     ],
     ids=["exchange", "four", "five"],
 )
