@@ -220,8 +220,9 @@ def _fault(name: str, part: ClusterVisibility) -> str | None:
         return f"{name}: the stream of the cameras has no {', '.join(part.absent)}: check the names"
     if part.misfits > MAX_MISFITS:
         return (
-            f"{name}: {part.suspect} was displaced since the static pose: check that "
-            "it is fixed and that no names are swapped, or repeat the static pose"
+            f"{name}: {part.suspect} does not move with the other markers as in the static pose: "
+            f"check that it is fixed on {name} and that no names are swapped, then repeat the "
+            "static pose"
         )
     if part.seen < MIN_SEEN:
         return (
