@@ -81,7 +81,8 @@ export function createStore() {
     reset(base) {
       Object.assign(store, {
         base, bridge: "unknown", info: null, health: null, calibration: null, progress: null, recording: null,
-        pose: null, poseReceivedMs: null, optical: null, sensors: null, clock: null,
+        pose: null, poseReceivedMs: null, optical: null, opticalReceivedMs: null,
+        sensors: null, sensorsReceivedMs: null, clock: null,
         events: [], poses: [], opticals: [], otherVersion: null, faulty: null,
       });
       store.received.clear();
@@ -207,7 +208,10 @@ function takeDevice(store, topic, payload) {
 /** Return the displayed time range of the curves, s. */
 export const shownSeconds = SHOWN_S;
 
-/** Return the own property of a payload; a name may be a word such as "constructor". */
+/**
+ * Return the value of a name in a payload; undefined if the payload lacks the name. Inherited properties are
+ * excluded, because the name of a sensor may be a word such as "constructor".
+ */
 export function valueOf(table, name) {
   return table && Object.hasOwn(table, name) ? table[name] : undefined;
 }
