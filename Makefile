@@ -1,4 +1,4 @@
-# jointfitd: everything a person types. Needs python3 (3.11 or newer), python3-venv and make.
+# jointfitd: the commands for users and contributors. They need python3 (3.11 or newer), python3-venv and make.
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
@@ -26,19 +26,19 @@ $(STAMP): pyproject.toml requirements.lock
 
 install: $(STAMP)  ## the programs in .venv; then: . .venv/bin/activate
 
-demo: $(STAMP)  ## the main job on simulated hardware, with an embedded broker
+demo: $(STAMP)  ## calibration and live joint angles on simulated sensors and cameras, with an embedded broker
 	@$(BIN)/jointfit demo $(ARGS)
 
-test: $(STAMP)  ## all tests that this machine can run, on all cores; what is skipped says why
+test: $(STAMP)  ## all tests that this machine can run, on all cores; skipped tests are listed with their reason
 	@$(BIN)/python .ci/suite.py $(ARGS)
 
-test-experiments: $(STAMP)  ## the short experiments of bench against their targets
+test-experiments: $(STAMP)  ## the short experiments of bench against their thresholds
 	@$(BIN)/python .ci/suite.py --experiments $(ARGS)
 
 test-cameras: $(STAMP)  ## a rig of four IMU families with each family of cameras, in real time, eight minutes
 	@JOINTFIT_ALL_CAMERAS=1 $(BIN)/python -m pytest -q --part experiments tests/system/test_camera_families.py
 
-compiled: $(STAMP)  ## compile the modules of the frame's path, into build/compiled (C compiler); nothing else uses them
+compiled: $(STAMP)  ## compile the modules that compute the output frames, into build/compiled (needs a C compiler)
 	@$(BIN)/python packaging/compiled.py $(ARGS)
 
 test-compiled: compiled  ## the tests of the core, on the compiled modules
@@ -47,7 +47,7 @@ test-compiled: compiled  ## the tests of the core, on the compiled modules
 	  tests/pipeline/test_core.py tests/pipeline/test_label_monitor.py tests/fusion/test_cluster_pose.py tests/timing/alignment tests/timing/clock tests/drivers/xbus tests/drivers/xcdi tests/packaging/test_variants.py \
 	  -m "not experiment and not system and not alone"
 
-test-cpu: $(STAMP)  ## the numerical tests as on other processors (ARGS=--all: all combinations)
+test-cpu: $(STAMP)  ## the numerical tests with the arithmetic of other processors (ARGS=--all: all combinations)
 	@$(BIN)/python .ci/cpu_features.py $(ARGS)
 
 test-root:  ## the tests and the demo on a fresh minimal Debian, as a user without root (mmdebstrap; root or sudo); ARGS="--suite trixie"
@@ -64,10 +64,10 @@ test-vm: $(STAMP)  ## virtual machines: SocketCAN on a real vcan; power cuts; th
 faults: $(STAMP)  ## every fault of docs/reliability.md on the real daemon (ARGS="--repeat 20" writes the page)
 	@$(BIN)/python -m tests.faults $(ARGS)
 
-endurance: $(STAMP)  ## the daemon for 50 million samples, faster than real time: nothing grows (ARGS="--samples 1000000")
+endurance: $(STAMP)  ## the daemon for 50 million samples, faster than real time; fails if memory or errors grow (ARGS="--samples 1000000")
 	@$(BIN)/python -m tests.endurance $(ARGS)
 
-load: $(STAMP)  ## every input of the daemon at its full rate for 30 minutes: nothing is lost (ARGS="--minutes 1")
+load: $(STAMP)  ## every input of the daemon at its full rate for 30 minutes; fails if a sample is lost (ARGS="--minutes 1")
 	@$(BIN)/python -m tests.load $(ARGS)
 
 $(VENV)/.fuzz: $(STAMP)
@@ -81,7 +81,7 @@ $(VENV)/.mutation: $(STAMP)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock --group mutation
 	@touch $@
 
-mutation: $(VENV)/.mutation  ## do tests notice small changes of protocols, timing, fusion and calibration record: 200 mutants (ARGS="--mutants 20 --jobs 2")
+mutation: $(VENV)/.mutation  ## share of 200 random code changes (mutants) that the tests detect, in protocols, timing, fusion and calibration record (ARGS="--mutants 20 --jobs 2")
 	@OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.mutation $(ARGS)
 
 lint: $(STAMP)  ## ruff: rules and format
@@ -91,10 +91,10 @@ lint: $(STAMP)  ## ruff: rules and format
 types: $(STAMP)  ## mypy, strict
 	@$(BIN)/mypy
 
-imports: $(STAMP)  ## who may import whom
+imports: $(STAMP)  ## rules for imports between packages
 	@$(BIN)/lint-imports
 
-bench: $(STAMP)  ## headline experiments and a quick one of every kind, 10 minutes; fails where a threshold is missed
+bench: $(STAMP)  ## the main experiments and a short one of every kind, 10 minutes; fails if a result misses its threshold
 	@$(BIN)/python -m bench $(ARGS)
 
 bench-full: $(STAMP)  ## all experiments, about an hour; writes bench/results and the pages of docs
@@ -110,10 +110,10 @@ docs: $(STAMP)  ## the documentation as a site, warnings are errors
 wheel: $(STAMP)  ## wheels (pure; compiled with a C compiler) and sdist in build/packages: checked, installed in empty environments
 	@$(BIN)/python .ci/check_wheel.py build/packages
 
-deb: $(STAMP)  ## the Debian package in build/packages, compiled with a C compiler; for a Raspberry Pi, pure: ARGS="--arch arm64"
+deb: $(STAMP)  ## the Debian package in build/packages, with compiled modules if a C compiler is installed; pure Python for a Raspberry Pi: ARGS="--arch arm64"
 	@$(BIN)/python packaging/deb.py $(ARGS)
 
-sbom: $(STAMP)  ## what the package carries, as CycloneDX JSON in build/packages
+sbom: $(STAMP)  ## bill of materials of the Debian package, as CycloneDX JSON in build/packages
 	@$(BIN)/python packaging/sbom.py $(ARGS)
 
 release: $(STAMP)  ## wheels, sdist, Debian packages and bill of materials with signed checksums: ARGS="--key KEY.pem"
@@ -125,8 +125,8 @@ vendor: $(STAMP)  ## fetch the dashboard's vendored scripts again by npm, and co
 audit: $(STAMP)  ## ask the Python vulnerability service about requirements.lock
 	@$(BIN)/python .ci/audit.py
 
-lock: $(STAMP)  ## write requirements.lock anew from what is installed now
+lock: $(STAMP)  ## write the versions that are installed now to requirements.lock
 	@$(BIN)/python .ci/lock.py > requirements.lock.new && mv requirements.lock.new requirements.lock || { rm -f requirements.lock.new; exit 1; }
 
-clean:  ## remove what make made
+clean:  ## delete the files that make created
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache .benchmarks

@@ -1,14 +1,15 @@
-"""Run the tests that measure no time on the installed arm64 package: `make test-arm`.
+"""Run the tests without time limits on the installed arm64 package: `make test-arm`.
 
     .ci/arm_root.py [--arch ARCH] [--suite NAME] [--package PACKAGE] [--recording PATH] [TESTS ...]
 
-Debian's arm64 system with the package runs in QEMU's user emulation, ten to twenty times slower
-than this machine. The tests import the installed package, with Debian's numpy and scipy, and not
-the modules of the checkout. A recording of this machine is verified by a replay in the system, and
-its calibration is fitted again. With ``--arch amd64`` the same steps run without emulation, which
-separates effects of the processor from those of Debian's libraries.
+The package is installed in a Debian arm64 system. QEMU's user emulation runs this system, ten to
+twenty times slower than this machine. The tests import the installed package, with Debian's numpy
+and scipy, and not the modules of the checkout. A recording that was made on this machine is
+replayed in the arm64 system and compared with the results of this machine. Its calibration is
+fitted again there. With ``--arch amd64`` the same steps run without emulation, which separates
+effects of the processor from those of Debian's libraries.
 
-JUnit reports, and the fitted calibration, are written to ``build/ARCH``. The exit status is 1 if
+The JUnit reports and the fitted calibration are written to ``build/ARCH``. The exit status is 1 if
 something failed, or 2 if the system cannot be set up.
 """
 
@@ -60,13 +61,15 @@ NOT_IN_EMULATION = (
     "tests/drivers/ports/test_python_can_bus.py::test_link_down_is_reported_once",
     "tests/calibration/phases/test_functional_fit.py::test_correction_has_smaller_errors",
 )
-"""Beginnings of the names of tests that fail in QEMU's user emulation. They need socket options
-that it lacks (IP_MULTICAST_IF, SO_MEMINFO), need CAN errors, or limit the processor time."""
+"""Beginnings of the names of tests that fail in QEMU's user emulation. Some need the socket options
+IP_MULTICAST_IF or SO_MEMINFO, or error reports of CAN, which the emulation lacks. Others limit the
+processor time."""
 PACKAGED = ("jointfit_daemon", "drivers", "protocols", "simulators", "jointfit_variant.py")
 """Paths of the checkout that the tests must import from the package."""
 FIT_TOLERANCE = 1e-9
-"""Largest accepted difference between the numbers of the two fits: relative for numbers above 1,
-absolute for smaller numbers. The libraries of the two machines round differently."""
+"""Largest accepted difference between the calibrations fitted in the system and on this machine. It
+is relative for numbers above 1, and absolute for smaller numbers. The libraries of the system and
+of this machine round differently."""
 RECORD = """\
 import pathlib, sys
 from tests.reprocessing.recorded_run import record_run
@@ -90,8 +93,9 @@ step 'jointfit doctor'
 step 'jointfit replay recording --verify'
 step 'jointfit calibrate --recording recording --out fitted.json'
 """
-"""Shell commands before the tests. The libraries of the tests are in /usr/local/lib/jointfitd, the
-folder for drivers of others, because the package searches it after its own libraries."""
+"""Shell commands before the tests. The libraries of the tests are installed in the folder for
+separate driver packages, /usr/local/lib/jointfitd. The jointfitd package searches this folder after
+its own libraries."""
 PYTEST = (
     "/usr/lib/jointfitd/bin/python3 -m pytest -q -p no:cacheprovider -p tests.older_scipy"
     " -o timeout=0 -o pythonpath=."
@@ -139,7 +143,10 @@ def main() -> int:
 
 
 def _is_same_fit(fitted: Path, work: Path) -> bool:
-    """Return whether the calibration equals this machine's fit; print the largest difference."""
+    """Compare the fitted calibration with a fit on this machine; return whether they agree.
+
+    The largest difference is printed.
+    """
     if not fitted.is_file():
         return False  # the step that failed has reported it
     here = work / "here.json"

@@ -1,4 +1,4 @@
-"""Check that systemd can read units and drop-ins, and that no unit has an exposure level above 1.2.
+"""Check that systemd can read our units and drop-ins, and that no exposure level exceeds 1.2.
 
 The exposure level is the result of `systemd-analyze security`.
 """

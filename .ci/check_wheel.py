@@ -69,7 +69,10 @@ def carry_the_page(wheel: Path) -> None:
 
 
 def install(archive: Path, work: Path, variant: str) -> None:
-    """Install an archive into an empty environment and try it, also without compiled modules."""
+    """Install an archive into an empty environment, and run its commands.
+
+    The modules must be those of `variant`, and pure Python with ``JOINTFIT_PURE=1``.
+    """
     home = work / f"venv-{variant}"
     venv.create(home, with_pip=True)
     run(home / "bin" / "pip", "install", "--quiet", "--constraint", LOCK, archive, cwd=work)

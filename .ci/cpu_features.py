@@ -2,8 +2,8 @@
 
     .ci/cpu_features.py [--all] [PYTEST ARGUMENTS]
 
-Kernels of OpenBLAS and loops of numpy round differently on each processor. If a decision depends on
-the last bits, a test passes in one of these runs and fails in another.
+Kernels of OpenBLAS and loops of numpy round differently on each processor. If a decision in the
+code depends on the last bits of a number, a test passes in one of these runs and fails in another.
 
 A run has the kernels (``OPENBLAS_CORETYPE``) and the loops (``NPY_DISABLE_CPU_FEATURES``) of one
 processor. The newest processor that this machine can imitate is omitted: `make test` covers it. A
@@ -34,8 +34,8 @@ TESTS = [
         "pipeline/sources",
     )
 ]  # fmt: skip
-"""Tests of packages that compute with numpy. Plain Python, such as the device clocks and the frames
-of the core, rounds equally on all processors."""
+"""Tests of packages that compute with numpy. Plain Python rounds equally on all processors. It
+computes, for example, the device clocks and the published poses."""
 
 
 @dataclass(frozen=True)

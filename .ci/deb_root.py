@@ -2,7 +2,7 @@
 
     .ci/deb_root.py [--suite NAME ...] PACKAGE
 
-Each system is mmdebstrap's minbase with the packages on which ours depends. Root installs the
+Each system is mmdebstrap's minbase with the packages on which jointfitd depends. Root installs the
 package; an ordinary user runs the demo. The demo runs in real time, so it has two attempts. Only
 the set-up needs root (or sudo). `.ci/arm_root.py` runs the tests in such a system.
 

@@ -97,9 +97,9 @@ def bootstrap(
 ) -> Path:
     """Make ``rootfs.tar`` in `work` from minbase and `packages`, and return its path.
 
-    The default of `architecture` is that of this machine. QEMU emulates any other.
+    By default, the root has the architecture of this machine. QEMU emulates another `architecture`.
     """
-    # Unstable has no security updates that an outdated mirror could hide.
+    # An expired package index is accepted for sid, which has no separate security updates.
     options = ["--aptopt=Acquire::Check-Valid-Until no"] if suite == "sid" else []
     if architecture is not None:
         options.append(f"--architectures={architecture}")

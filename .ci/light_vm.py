@@ -3,9 +3,9 @@
 
     .ci/light_vm.py [--time-limit S] [--memory M] [--out DIR] [-- PYTEST ARGUMENTS]
 
-The script boots Debian's user-mode-linux (packages: user-mode-linux, iproute2) on the host's own
-files, which are read-only. It starts vcan0 and runs ``pytest -m vm tests/vm`` with the Python that
-runs this script. The guest can write to DIR only, which receives junit.xml.
+The script boots Debian's user-mode-linux (packages: user-mode-linux, iproute2). The root file
+system of the guest is the host's, read-only. The guest starts vcan0 and runs ``pytest -m vm
+tests/vm`` with the Python that runs this script. It can write to DIR only. DIR receives junit.xml.
 
 The exit status is the status of pytest; 1 if a test was skipped or no test ran; 90 if the guest did
 not reach the end of pytest; 124 at the time limit; 2 if the machine cannot be started.
@@ -36,7 +36,7 @@ CAN_MODULES = (
     "drivers/net/veth",
 )
 HIDDEN = ("/tmp", "/run", "/var/tmp", "/mnt")
-"""Folders that are empty in the guest. Their needed parts are mounted again."""
+"""Folders that are empty in the guest. Subfolders that the tests need are mounted again."""
 
 PREPARE = """\
 #!/bin/sh
@@ -137,7 +137,7 @@ def write_init(path: Path, out: Path, commands: str, **words: str) -> None:
 
 
 def machine_command(work: Path, memory: str, *more: str) -> list[str]:
-    """Return the command of a machine on the host's own files, which are read-only."""
+    """Return the command of a machine whose root is the host's file system, read-only."""
     return [
         uml.UML, f"mem={memory}", "rootfstype=hostfs", "rootflags=/", "ro", f"init={work / 'init'}",
         *uml.CONSOLE, "quiet", f"uml_dir={work}", "umid=light", *more,

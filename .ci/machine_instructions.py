@@ -1,11 +1,11 @@
-"""Count the machine instructions of a frame on x86-64 and on arm64, in QEMU's user emulation.
+"""Count the instructions that compute one output frame on x86-64 and on arm64, in QEMU.
 
     .ci/machine_instructions.py CALIBRATION
 
-Debian's Python of each architecture runs ``bench.rigs.core_frames`` with the pure wheel of this
-checkout and the libraries of requirements.lock. The count is the difference between a long and a
-short run, so it does not contain the start of Python. `CALIBRATION` is a file with a calibration of
-the simulated subject.
+QEMU's user emulation runs Debian's Python of each architecture. Python runs
+``bench.rigs.core_frames`` with the pure wheel of this checkout and the libraries of
+requirements.lock. The count is the difference between a long and a short run, so it does not
+contain the start of Python. `CALIBRATION` is a file with a calibration of the simulated subject.
 
 The result on standard output is JSON: the mean number of instructions per frame, by architecture.
 The exit status is 2 if a tool or a system is missing.

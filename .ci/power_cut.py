@@ -11,7 +11,8 @@ the host.
 
 Invariant: every recording can be opened. It lacks at most the last second before the cut.
 
-The exit status is 0, or 1 if a recording lacks more. Other values are those of ``light_vm.py``.
+The exit status is 0 if the invariant holds, and 1 otherwise. Other values are those of
+``light_vm.py``.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from jointfit_daemon.outputs.recording import RecordedMessage, open_recording
 DISK_MIB = 16
 DISKS = "/dev/shm"  # noqa: S108 - memory: a busy disk of the host would delay the guest
 LONGEST_LOSS_S = 1.0
-"""Longest accepted loss on a machine with its own processor, s."""
+"""Longest accepted loss if no other load of the host delays the guest, s."""
 STAMP_S = 0.1
 """Time between two stamps, s. A stamp is the arrival time of a chunk, which the guest prints. A
 longer time is caused by the load of this machine."""
@@ -121,7 +122,7 @@ class RecordingMachine:
 
 
 def is_traced(process: int) -> bool:
-    """Return whether the guest kernel traces a process, which then belongs to the guest."""
+    """Return whether a process belongs to the guest, whose kernel traces all its processes."""
     status = Path(f"/proc/{process}/status").read_text(encoding="ascii")
     return "\nTracerPid:\t0\n" not in status
 

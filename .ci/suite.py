@@ -11,9 +11,9 @@ send in real time. Other tests on the same cores can delay both. If such a test 
 run, it is repeated once, alone. It counts as passed only if the repetition passes, and the summary
 names it.
 Experiments are repeated in the same way, because those that compute run at low priority and can
-exceed a time limit. A wrong result is wrong in both runs. Tests with the marker `alone` measure
-times, which a pause of the machine disturbs, so they are repeated, too. Other tests are not
-repeated.
+exceed a time limit. An experiment with a wrong result fails in both runs. Tests with the marker
+`alone` measure times, which a pause of the machine disturbs, so they are repeated, too. Other tests
+are not repeated.
 
 Invariant: the exit status is 0 only if both parts passed.
 """

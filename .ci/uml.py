@@ -1,8 +1,8 @@
 """A Linux kernel as an ordinary process (Debian's user-mode-linux, UML), with clean start and end.
 
 Invariant: no process of a machine outlives the script that booted it. A result counts only if the
-guest wrote it. ``light_vm.py`` (with the host's own files) and ``full_vm.py`` (an image with
-systemd) use this module.
+guest wrote it. The root of the guest is the file system of the host (``light_vm.py``) or a disk
+image with systemd (``full_vm.py``).
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ PACKAGES = (
 )  # fmt: skip
 TOOLS = {"mmdebstrap": "mmdebstrap", "mke2fs": "e2fsprogs", "fakeroot": "fakeroot"}
 HOOKS = (
-    # Without a hosts file, as in minbase, localhost does not resolve.
+    # minbase has no hosts file, so localhost would not resolve.
     'printf "127.0.0.1 localhost vm\\n::1 localhost\\n" > "$1/etc/hosts"',
     'echo vm > "$1/etc/hostname"; : > "$1/etc/machine-id"; mkdir -p "$1/usr/lib/modules"',
 )

@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
-"""Compile the modules of the frame's path with mypyc: `python packaging/compiled.py [--out DIR]`.
+"""Compile the modules that compute each frame: `python packaging/compiled.py [--out DIR]`.
 
-The command writes the packages as a wheel would install them, with sources and extension modules,
-into DIR (default: build/compiled). The module is also the build hook of the wheel. With
-``JOINTFIT_COMPILED=1`` the hook adds the extension modules to the wheel. Otherwise, wheels and
-editable installations are pure Python. The modules are listed in pyproject.toml. They are compiled
-again only if a source, the list, the compiler or mypy has changed.
+The compiler is mypyc. The command writes the packages as a wheel would install them, with sources
+and extension modules, into DIR (default: build/compiled). This file is also the build hook of the
+wheel. With ``JOINTFIT_COMPILED=1`` the hook adds the extension modules to the wheel. Otherwise,
+wheels and editable installations are pure Python. The modules to compile are listed in
+pyproject.toml. They are compiled again only if a source, the list, the compiler or mypy has
+changed.
 
 Invariant: the sources are compiled without changes. A wheel contains the sources and the compiled
 modules.

@@ -11,8 +11,8 @@ compiler exists.
 The package contains its own site-packages, for all Python versions in `PYTHONS`: the names of
 extension modules contain the Python version, and all other files are the same for all versions. Its
 interpreter /usr/lib/jointfitd/bin/python3 is a link to Debian's Python. Other programs cannot
-import packages of jointfitd. jointfitd can import only `FROM_DEBIAN` of Debian's packages, through
-links.
+import packages of jointfitd. Of Debian's Python packages, jointfitd can import only those in
+`FROM_DEBIAN`, through links.
 """
 
 from __future__ import annotations

@@ -23,10 +23,14 @@ class LateStartContract:
     """Part of `jointfit_simulators.driver_contract.DriverContract`."""
 
     has_history: ClassVar[bool] = False
-    """Whether samples depend on many earlier samples, as those of an orientation filter."""
+    """Whether a sample depends on many earlier samples, for example through a filter."""
 
     def test_a_decoder_that_starts_later_needs_the_description(self: Any, tmp_path: Path) -> None:
-        """A recording that starts while the device streams begins with the description."""
+        """A decoder that receives the description first returns all samples of a later stream.
+
+        The description is the attribute `description` of the decoder: the newest messages on which
+        the decoding of the data depends.
+        """
         if self.has_history:
             raise SkipTest("the orientation filter begins again")
 
@@ -46,8 +50,9 @@ class LateStartContract:
 def decode_later(driver: Driver, receiver: DecodingReceiver, count: int) -> list[Any]:
     """Return the last `count` measurements from a decoder that receives only the last chunks.
 
-    Before these chunks it receives the description of the data. If the first decoder has no
-    description, it receives the chunks before the first measurement instead.
+    Before these chunks, the new decoder receives the attribute `description` of the first decoder.
+    If the first decoder has no such attribute, the new decoder receives the chunks before the first
+    measurement instead.
     """
     again, opening, begin = receiver.restarted(driver), [], 0
     for place, chunk in enumerate(receiver.chunks):

@@ -462,7 +462,7 @@ class DriverContract(LateStartContract, ABC):
         asyncio.run(scene())
 
     def test_cancelling_closes_all_descriptors_and_tasks(self, tmp_path: Path) -> None:
-        """``run`` can be cancelled before, during and after the opening of the device."""
+        """After ``run`` is cancelled at any stage, no descriptor is open and no task runs."""
 
         async def scene() -> None:
             device, driver = self.make_device(tmp_path, clean_wire), self.make_driver(tmp_path)

@@ -61,7 +61,7 @@ class Knobs:
     heading_spread_deg: float = 90.0
     """Largest heading difference between the sensors' world frames."""
     optical_heading_deg: float = 180.0
-    """Largest heading of the subject in the optical world, in both directions."""
+    """Largest magnitude of the heading of the subject in the optical world."""
     world_tilt_deg: float = 0.0
     """Fault: inclination error of a sensor's world frame."""
     world_tilt_sensor: str = ""

@@ -1,4 +1,4 @@
-"""Codec of the board's frames: documented bytes, any split of the stream, counted bytes."""
+"""Tests of the codec: documented bytes, streams that are split at any byte, and counted bytes."""
 
 from __future__ import annotations
 

@@ -48,7 +48,8 @@ def batch(
 
     The command skips every recording that an earlier run has processed, unless the bytes of the
     recording, the steps, the formats or the version of this program changed. Exit codes: 0 all
-    recordings are processed; 1 at least one recording failed or has a different replay.
+    recordings are processed; 1 at least one recording failed, or its replay differs from the
+    recorded run.
     """
     from jointfit_daemon.files.sessions import SESSION_FORMATS
     from jointfit_daemon.tools.batch.executors import run_in_pool, run_on_cluster

@@ -37,7 +37,7 @@ class RequestRefusedError(Exception):
 
 
 def raise_if_refused(answer: Mapping[str, Any]) -> None:
-    """Raise `RequestRefusedError` if the daemon rejected the request, with the daemon's message."""
+    """If the daemon rejected the request, raise `RequestRefusedError` with the daemon's message."""
     if answer.get("status") == "error":
         raise RequestRefusedError(str((answer.get("error") or {}).get("message")))
 
@@ -61,7 +61,8 @@ class PhaseTracker:
     """Time at which the wait for the daemon ends, in seconds of the event loop's clock. None while
     the daemon is online."""
     _requested: bool = False
-    """Whether the phase was requested. Earlier messages are retained or belong to other phases."""
+    """Whether the phase was requested. A message that arrives before the request is a retained
+    message or belongs to another phase."""
     _phase_before: object = None
     """Phase in the last status before the request."""
     _status_before: object = None
@@ -115,7 +116,7 @@ class PhaseTracker:
         self._changed.set()
 
     async def wait_for_retained(self) -> None:
-        """Wait for the retained status, which precedes the request; at most `RETAINED_S`."""
+        """Wait at most `RETAINED_S` for the retained status, before the request is sent."""
         with suppress(TimeoutError):
             async with asyncio.timeout(RETAINED_S):
                 while not self.status:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class ChainOptions:
-    """Options of the command for a chain."""
+    """Command-line options of `jointfit center` for a chain of segments."""
 
     segments: Sequence[Sequence[str]]
     joints: Sequence[str]

@@ -1,7 +1,7 @@
 """Plot of child markers in the parent frame with the estimated centre, in three projections.
 
-Both axes have equal scales, and the 95 % ellipse has the same scale. An unobservable direction is
-drawn as a line. The ellipse then covers the remaining directions.
+Both axes have equal scales, and the 95 % ellipse is drawn to this scale. An unobservable direction
+is drawn as a line. The ellipse then covers the remaining directions.
 """
 
 from __future__ import annotations

@@ -115,7 +115,7 @@ def chain_joints(
     Raises
     ------
     UnsuitableTrialError
-        Too few markers, a marker named twice, or a joint without a frame in either segment.
+        Too few markers, a marker named twice, or a joint of which neither segment has a frame.
     """
     least = MIN_MARKERS if plane is None else LEAST_PLANAR
     _check_segments(segments, names, least)
@@ -177,7 +177,7 @@ def _check_segments(segments: Sequence[Sequence[str]], names: Sequence[str], lea
 
 
 def _refuse_other_segment(answer: WindowEstimate, child: Sequence[str]) -> WindowEstimate:
-    """Refuse a centre if the distance of the child's markers to the centre varies."""
+    """Refuse a centre if the distance of the child's markers to the centre varies too much."""
     e = answer.estimate
     if not MAX_FIT_RMS_M < e.residual < inf:
         return answer

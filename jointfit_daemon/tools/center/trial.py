@@ -127,7 +127,8 @@ def reduce(
     Raises
     ------
     UnsuitableTrialError
-        Too few or collinear parent markers, or no frame with all of them.
+        The parent markers are too few, are collinear, are never visible together, do not move
+        rigidly, or have exchanged names.
     """
     if both := sorted(set(parent) & set(markers)):
         raise UnsuitableTrialError(
@@ -246,8 +247,8 @@ def _reduce_planar(seen: Array, child: Array, basis: Array, interval: float) -> 
     z = flat[..., 0] + 1j * flat[..., 1]
     whole = np.flatnonzero(np.isfinite(z).all(axis=1))
     middle = z.mean(axis=1)
-    # The template is the median of all complete frames, each rotated so that the second marker lies
-    # on the x axis through the first marker.
+    # The template is the median of all complete frames. Each frame is first rotated so that the
+    # direction from the first to the second marker is the x axis.
     turned = (z - middle[:, None]) * np.exp(-1j * np.angle(z[:, 1] - z[:, 0]))[:, None]
     template = np.median(turned[whole].real, axis=0) + 1j * np.median(turned[whole].imag, axis=0)
     template -= template.mean()
@@ -312,7 +313,10 @@ def answers(
 
 
 def _refuse_small_motion(found: CenterEstimate, points: Array) -> CenterEstimate:
-    """Refuse an estimate if rotational noise of the parent could explain the motion."""
+    """Refuse an estimate if the child markers move by less than `STILL_M`.
+
+    Rotational noise of the parent could explain such a small motion.
+    """
     seen = visible(points)
     if not seen.any():
         return found

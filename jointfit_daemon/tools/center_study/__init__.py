@@ -1,4 +1,4 @@
-"""Command `jointfit center-study`: repeats a published numerical experiment."""
+"""Command `jointfit center-study`: repeats the numerical experiment of Akbarifar et al. (2021)."""
 
 from jointfit_daemon.tools.center_study._command import center_study
 

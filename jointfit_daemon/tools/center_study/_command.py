@@ -1,4 +1,7 @@
-"""Command `jointfit center-study`: repeats a published numerical experiment."""
+"""Command `jointfit center-study`: repeats the numerical experiment of Akbarifar et al. (2021).
+
+The experiment determines the errors of circle fits that estimate a centre of rotation.
+"""
 
 from __future__ import annotations
 

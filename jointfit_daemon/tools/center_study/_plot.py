@@ -1,7 +1,9 @@
-"""Maps of the numerical experiment as figures.
+"""Error maps of the numerical experiment as figures.
 
-All maps of a row share one colour scale, which is clipped to limit the effect of outliers. Cells
-without an estimate are hatched.
+A map shows the error over two of three quantities: the angle α between two successive positions of
+the marker, its distance r from the centre of rotation, and the noise σ per coordinate. All maps of
+a row share one colour scale, which is clipped to limit the effect of outliers. Cells without an
+estimate are hatched.
 """
 
 from __future__ import annotations

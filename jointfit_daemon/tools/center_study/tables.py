@@ -1,4 +1,8 @@
-"""Results of the numerical experiment as text (mm, degrees) and as JSON (SI units)."""
+"""Results of the numerical experiment as text (mm, degrees) and as JSON (SI units).
+
+α is the angle between two successive positions of a marker, r its distance from the centre of
+rotation, and σ the noise per coordinate.
+"""
 
 from __future__ import annotations
 
@@ -30,13 +34,14 @@ stands for no clipping."""
 CAVEATS = (
     "Three noisy points can be collinear, so the error of the analytic solution has no finite"
     " mean square: single outliers determine the raw correlation, which changes with the seed."
-    " The printed table can be approached only with clipped errors and a small box.",
-    "Clipping limit and box were chosen so that the results approach the printed table (marked *)."
-    " The publication states neither these values nor the region and step of the grid. Some of its"
+    " The results approach the published table only with clipped errors and a small search region"
+    " of the grid.",
+    "Clipping limit and search region were chosen so that the results approach the published table"
+    " (marked *). The publication states neither these values nor the step of the grid. Some of its"
     " digits are illegible.",
-    "At small α the grid has smaller errors than the analytic solution, because its box is centered"
-    " on the true center and limits the error: at α = 5° the error equals the box. With three"
-    " points both methods have the same optimum.",
+    "At small α the grid has smaller errors than the analytic solution, because its search region"
+    " is centered on the true center and limits the error: at α = 5° the error equals half the"
+    " width of the region. With three points both methods have the same optimum.",
     "On long arcs a grid with a node on the true center finds this center exactly. With the grid"
     " shifted by half a step, the error is at least 0.71 steps. Both grids are shown.",
     "Equations 14 and 15 of the publication are mean squares. F is the square root of equation 15"

@@ -1,7 +1,7 @@
 """Web server of the dashboard: page files, page configuration, and the tunnel to the broker.
 
-Invariant: every response forbids scripts, styles and connections from other origins. Only pages of
-this server can use the tunnel.
+Invariants: every response forbids scripts and styles from other origins, and connections to other
+origins except the WebSocket of the configured broker. Pages of other origins cannot use the tunnel.
 """
 
 from __future__ import annotations
@@ -241,7 +241,7 @@ def _path(target: str) -> str | None:
 
 
 def _authority(origin: str) -> str | None:
-    """Return host and port of an Origin header; None if the header contains none."""
+    """Return host and port of an Origin header; None if the header is not a URL."""
     try:
         return urlsplit(origin).netloc.lower()
     except ValueError:

@@ -71,7 +71,7 @@ class SetUpServer(DashboardServer):
 
 
 def set_up_server(server: DashboardServer, path: Path) -> SetUpServer:
-    """Return a server with the settings of `server` that also sets up the rig at `path`."""
+    """Return a server with the settings of `server`, and a page that sets up the rig at `path`."""
     return SetUpServer(
         server.broker,
         server.context,

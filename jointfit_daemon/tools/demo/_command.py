@@ -58,12 +58,12 @@ def demo(
     """Run the daemon on simulated hardware; needs no device, broker or root access.
 
     The command starts a broker, a motion-capture server, the daemon and four IMUs: two on
-    pseudo-terminals and two on a CAN adapter (for an arm, three and three). Then it calibrates, and
-    compares the joint angles with ground truth. It exits with 1 if a step fails or a target is
-    missed. The targets are: flexion error of the knee (elbow, lumbar joint) at most 3 degrees RMS,
-    all samples accounted for, and 99 % of the frames received within 60 ms. Ctrl-C, SIGTERM and
-    SIGHUP stop the run and print the results so far. With --web, the limb is calibrated and then
-    moves until you stop the run; nothing is compared, and the exit code is 0.
+    pseudo-terminals and two on a CAN adapter (arm: three and three; legs: five and five). Then it
+    calibrates, and compares the joint angles with ground truth. It exits with 1 if a step fails or
+    a target is missed. The targets are: flexion error of the knee (elbow, lumbar joint) at most 3
+    degrees RMS, all samples accounted for, and 99 % of the frames received within 60 ms. Ctrl-C,
+    SIGTERM and SIGHUP stop the run and print the results so far. With --web, the limb is calibrated
+    and then moves until you stop the run. Nothing is compared then, and the exit code is 0.
     """
     if not (math.isfinite(seconds) and seconds > 0.0):
         raise ValueError(f"--seconds {seconds:g}: expected a finite number above 0")

@@ -91,7 +91,7 @@ class DemoDisplay:
         self._draw()
 
     def figures(self, data: Mapping[str, Any]) -> None:
-        """Show the predicted errors of joint centres, which exist in the functional phase only."""
+        """Show the predicted errors of the joint centres; only the functional phase has them."""
         if self._step == "functional":
             self._joints = movement_lines(data)
             self._draw()

@@ -244,7 +244,10 @@ class DemoRun:
     # --- results -----------------------------------------------------------------------------
 
     def figures(self) -> dict[str, Any]:
-        """Return errors, latency and sample counts; None for values not yet known."""
+        """Return errors, latency and sample counts; None for values not yet known.
+
+        Samples that have no outcome yet count as dropped.
+        """
         devices = self._health.get("devices", {})
         counts = {
             key: sum(int(device.get(key) or 0) for device in devices.values())

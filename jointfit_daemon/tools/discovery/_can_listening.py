@@ -1,7 +1,7 @@
 """Reception on one CAN network interface, and the sensors that the drivers recognize.
 
-Invariant: nothing is sent and no setting is changed. As with any program, a controller in normal
-mode acknowledges the received frames.
+Invariant: no frame is sent and no setting is changed. Independently of this module, a controller in
+normal mode acknowledges every frame on the bus.
 """
 
 from __future__ import annotations

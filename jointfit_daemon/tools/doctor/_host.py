@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 _TIMEX_BYTES = 256
-"""Size of the buffer for ``struct timex``, bytes; the structure is smaller. The value 0 in its
-field ``modes`` only reads the clock state."""
+"""Size of the buffer for ``struct timex``, bytes; the structure is smaller. Its field ``modes`` is
+0, so the call of adjtimex only reads the clock state."""
 _STATUS_OFFSET = 40
 """Offset of the field ``status`` on 64-bit systems, bytes. Five fields precede it."""
 _STA_UNSYNC = 0x40

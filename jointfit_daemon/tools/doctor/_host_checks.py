@@ -25,7 +25,7 @@ _SERVICE_STATE = "/var/lib/jointfitd"
 
 
 def check_clock(host: Host, *, needed: bool) -> Iterator[Finding]:
-    """Yield the finding on clock synchronization, which is `needed` for PTP stamps of cameras."""
+    """Yield the finding on clock synchronization; `needed` if cameras send PTP time stamps."""
     synchronized = host.clock_is_synchronized()
     if synchronized is None:
         text = "the state of the clock cannot be read here"

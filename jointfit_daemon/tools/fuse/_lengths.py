@@ -118,10 +118,10 @@ def _measured_lengths(
 ) -> dict[str, MeasuredLength]:
     """Return the lengths of segments whose two joint centers are in the reference files.
 
-    The origin of a bone (``p_BONE``) is its proximal joint center. The length of a segment is the
-    median distance from its origin to the origin of the next segment, over all files. The standard
-    deviation of the length is robust (median absolute deviation). The last segment has no next
-    segment, so its length remains unknown.
+    Only NPZ files contain origins of bones (``p_BONE``). The origin of a bone is its proximal joint
+    center. The length of a segment is the median distance from its origin to the origin of the next
+    segment, over all files. The standard deviation of the length is robust (median absolute
+    deviation). The last segment has no next segment, so its length remains unknown.
     """
     arrays = [path for path in references if path.suffix.lower() == ".npz"]
     recordings = [read_recording(path, limb.up) for path in arrays]

@@ -1,4 +1,7 @@
-"""Notes on lags, which `jointfit fuse apply` ignores, and on the side, which a model lacks."""
+"""Notes on sensor lags, which `jointfit fuse apply` ignores, and on the side of the limb.
+
+A model file does not contain the side (left or right), which sets the signs of some angles.
+"""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ class FusedAngles:
     inner: Array
     """Inner angle between the two segments, rad, shape (n,)."""
     patent: Array
-    """The angles `PATENT_ANGLES` that `read_patent` returns, rad, shape (n, 4)."""
+    """Joint angles `PATENT_ANGLES` as defined by the patent CN 114533039 B, rad, shape (n, 4)."""
     patent_gimbal: Array
     """Whether the angles in `patent` are in gimbal lock, 1 or 0, shape (n,)."""
     convention: AngleConvention
@@ -87,7 +87,7 @@ class FusedTrial:
     segments: Mapping[str, Array]
     """Segment orientations q_world_segment, z up, shape (n, 4); NaN where unknown."""
     sd: Mapping[str, Array]
-    """Standard deviation of each segment, rad, shape (n,)."""
+    """Standard deviation of each segment orientation, rad, shape (n,)."""
     angles: Mapping[str, FusedAngles]
     """Angles of each joint between two segments, by joint."""
     positions: Mapping[str, FusedPosition]

@@ -170,7 +170,7 @@ def sensors_of(chain: Chain) -> list[str]:
 
 
 def name_trials(trials: Sequence[OfflineTrial], paths: Sequence[Path]) -> list[OfflineTrial]:
-    """Return the trials with unique names; files with equal stems are named by their full path.
+    """Return the trials with unique names; files with equal stems are named by their path.
 
     Raises
     ------
@@ -264,7 +264,10 @@ def _check_stillness(path: Path, found: Mapping[str, RobustMean]) -> None:
 
 
 def read_mounts(path: Path, chain: Chain) -> dict[str, Array]:
-    """Read sensor alignments from JSON, ``{"q_bias": {SENSOR: [w, x, y, z]}, "up": "y"}``."""
+    """Read sensor alignments from JSON, ``{"q_bias": {SENSOR: [w, x, y, z]}, "up": "y"}``.
+
+    The vertical axis ``up`` is ``y`` (default) or ``z``.
+    """
     from jointfit_daemon.files.text import MalformedFileError, read_json
 
     try:

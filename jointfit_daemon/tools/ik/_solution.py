@@ -51,7 +51,7 @@ _MOST_HINTS = 5
 """Maximum number of missing markers in a note that proposes similar names."""
 _FEWEST_MARKERS = 3
 """Minimum number of visible markers in a frame with a solution. Fewer markers do not determine the
-position of the first segment."""
+pose of the first segment."""
 _MISFIT_RAD = 0.0017
 """Rotation that the coordinates of the model cannot represent, above which a note is given, rad
 (0.1 degrees)."""
@@ -59,7 +59,7 @@ _MISFIT_RAD = 0.0017
 
 @dataclass(frozen=True, slots=True)
 class IkRequest:
-    """Command-line options."""
+    """Command-line options of `jointfit ik`."""
 
     trial: Path
     model: Path

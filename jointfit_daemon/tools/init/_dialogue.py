@@ -1,6 +1,6 @@
 """The text dialogue, which shows questions, reads answers and starts searches.
 
-Invariant: only `Dialogue.read_line` waits for the user, and every accepted answer is stored at
+Invariant: only `Dialogue.read_line` waits for typed input, and every accepted answer is stored at
 once.
 """
 
@@ -216,7 +216,10 @@ class Dialogue:
             self.store(self.known)
 
     def find(self, asked: Asked) -> None:
-        """Start the search of a question, and accept its result.
+        """Start the search of a question.
+
+        The search for a moved sensor accepts its result as the answer. All other searches only
+        change the proposed answer.
 
         Raises
         ------

@@ -177,7 +177,11 @@ _PORT_WITHOUT_FOLDER = re.compile(r"tty\w+|COM\d+", re.IGNORECASE)
 
 
 def complete(answers: Mapping[Key, Any], found: Found) -> Answers:
-    """Return an answer to every question; defaults or stand-ins replace missing answers."""
+    """Return an answer to every question.
+
+    A default replaces a missing answer. Without a default, the stand-in of the question, which is
+    a valid answer for checks, replaces it.
+    """
     filled = dict(answers)
     for question, subject in _in_order(filled, found):  # later questions depend on `filled`
         key = question.key, subject

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class ModelRequest:
-    """Command-line options that change the model."""
+    """Command-line options of `jointfit markers` that change the chain model."""
 
     model: Path
     lock: tuple[str, ...] = ()

@@ -35,7 +35,7 @@ _NAME = 12
 
 @dataclass(frozen=True, slots=True)
 class DeviceSummary:
-    """Texts and level that describe one device."""
+    """Texts about one device, and the severity level of its state."""
 
     name: str
     place: str

@@ -82,7 +82,10 @@ def limb_lines(
 
 
 class _Scale:
-    """Conversion of metres to dots with equal scales; the whole reach of the limb fits."""
+    """Conversion of metres to dots with equal scales.
+
+    All positions that the limb has reached so far (`RigView.reach_m`) fit on the canvas.
+    """
 
     def __init__(self, reach_m: list[float], canvas: DotCanvas, columns: int) -> None:
         across_m, low_m, high_m = reach_m

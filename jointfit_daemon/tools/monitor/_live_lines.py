@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.monitor._rig_view import Moment, RigView
 
 STALE_S = 1.5
-"""Age of a pose, s, at which its values disappear from the screen."""
+"""Age of a pose, s, above which its angle disappears and its limb is drawn in the muted style."""
 _OPTICAL_S = 0.6
-"""Age of a pose from the cameras, s, at which this pose disappears from the screen."""
+"""Age of a pose from the cameras, s, above which this pose disappears from the screen."""
 _WIDE = 72
 """Smallest width at which the limb is to the left of the curve, cells."""
 _LEAST_CURVE, _MOST_CURVE = 3, 24

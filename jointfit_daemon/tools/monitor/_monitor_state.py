@@ -62,7 +62,7 @@ Action = SendRequest | ChooseRig | AskMark | Quit
 
 @dataclass(slots=True)
 class RequestOutcome:
-    """Outcome of the last request."""
+    """Outcome of the last request to the daemon, as shown to the user."""
 
     text: str
     refused: bool
@@ -225,7 +225,10 @@ class MonitorState:
         return SendRequest("use-calibration", {"revert": True}) if key == "r" else None
 
     def _move(self, key: str) -> bool:
-        """Scroll, turn the limb, or choose an angle; return whether the key has such an effect."""
+        """Scroll, turn the limb, choose an angle, or filter the log, depending on the key.
+
+        Return whether the key has one of these effects.
+        """
         steps = {"down": 1, "up": -1, "pagedown": _PAGE, "pageup": -_PAGE}
         if key in steps:
             self.scroll = max(0, self.scroll + steps[key])
@@ -245,7 +248,8 @@ class MonitorState:
     def _record(self) -> Action | None:
         """Return the request that the key R causes, or None.
 
-        The key starts a recording at the first press, and stops a recording at the second press.
+        If nothing is recorded, the key starts a recording. During a recording, the first press asks
+        for confirmation, and the second press stops the recording.
         """
         recording, asked = recording_of(self.rig), self.asked_to_stop
         self.asked_to_stop = recording is not None and recording.active and not asked

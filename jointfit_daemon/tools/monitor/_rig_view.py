@@ -211,7 +211,7 @@ def _angles(pose: Pose | OpticalPose) -> AngleSample:
 
 
 def _append(samples: deque[AngleSample], sample: AngleSample) -> None:
-    """Append a sample; remove samples that are older than the curve."""
+    """Append a sample; remove samples that are older than the time range of the curve."""
     samples.append(sample)
     oldest_us = sample.t_us - SHOWN_S * 1e6
     while samples[0].t_us < oldest_us:

@@ -1,7 +1,7 @@
 """The whole screen as text lines: header, tabs, banner, the chosen view, notice, and keys.
 
-Invariant: `screen_lines` is a pure function. The number and the width of its lines equal those of
-the terminal.
+Invariants: `screen_lines` uses no clock, I/O or terminal, and changes only the scroll position of
+the state. The number and the width of its lines equal those of the terminal.
 """
 
 from __future__ import annotations

@@ -60,7 +60,8 @@ _DETAIL_S = 10.0
 """Duration of the section of a long session that is drawn in detail, s."""
 _UNSHOWN = 0.1
 """Largest share of the session that may pass before the first known angle. If the share is larger,
-for example because of a calibration, the curves begin at the first angle instead of the start."""
+for example because of a calibration, the curves begin at the first known angle. Otherwise, they
+begin at the start of the session."""
 _PANEL, _HALF = 320.0, 450.0
 """Widths of a panel, px, in a row of three and in a row of two panels."""
 _MOST_POINTS = 800
@@ -363,8 +364,8 @@ def comparison_section(results: SessionResults) -> str:
             f'<div class="panels pairs">{panels}</div>',
             paragraph(
                 "Bias: mean difference. Limits of agreement: bias ± 1.96 standard deviations (Bland"
-                " and Altman 1986). Inside interval: share of the differences within the 95 %"
-                " interval that the sensors stated; 95 % is expected. The angles from the cameras"
+                " and Altman 1986). Inside interval: share of the differences within the published"
+                " 95 % interval of the sensor angles; 95 % is expected. The angles from the cameras"
                 " have errors, too, mainly from soft tissue.",
                 "note",
             ),

@@ -137,6 +137,9 @@ def ground(style: MovementStyle, coordinates: Array) -> None:
 
 
 def smootherstep(x: Array) -> Array:
-    r"""Return :math:`6x^5 - 15x^4 + 10x^3` of `x`, clipped to [0, 1], which is smooth (C2)."""
+    r"""Return :math:`6x^5 - 15x^4 + 10x^3` of `x` clipped to [0, 1].
+
+    The function has two continuous derivatives.
+    """
     x = np.clip(x, 0.0, 1.0)
     return x**3 * (x * (6 * x - 15) + 10)

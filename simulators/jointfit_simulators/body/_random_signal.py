@@ -20,7 +20,7 @@ LINES = 48
 class RandomSignal:
     r"""Stationary, nearly Gaussian signal of several channels within a frequency band.
 
-    .. math:: x_c(t) = \sum_k a_{ck}\cos 2\pi f_k t + b_{ck}\sin 2\pi f_k t
+    .. math:: x_c(t) = \sum_k (a_{ck}\cos 2\pi f_k t + b_{ck}\sin 2\pi f_k t)
 
     This is Rice's sum of sinusoids for each channel *c* (Bell Syst. Tech. J. 23, 1944). The band is
     divided into equal parts, and each frequency :math:`f_k` is random within its part. The

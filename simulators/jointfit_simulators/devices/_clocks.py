@@ -3,7 +3,7 @@
 A device clock has an offset, a skew and jitter relative to host CLOCK_MONOTONIC, which is the true
 time. The transport of a device adds a delay.
 
-Invariant: a device samples at whole periods of its own clock.
+Invariant: the sampling times are whole multiples of the sample period on the clock of the device.
 """
 
 from __future__ import annotations

@@ -2,14 +2,15 @@ r"""Inertial and magnetic signals of a sensor that rotates in place.
 
 The signals follow from two successive orientations, without noise:
 
-.. math:: \omega = \log(q_{k-1}^{*} q_k) / T, \qquad f = R_k^{T} (0, 0, g), \qquad
+.. math:: \omega = 2 \log(q_{k-1}^{*} q_k) / T, \qquad f = R_k^{T} (0, 0, g), \qquad
     m = R_k^{T} (0, \cos\delta, -\sin\delta)
 
-ω is the angular rate, f the specific force, and m the magnetic field in sensor axes. T is the time
-between the two orientations, R_k is the matrix of q_k, and δ is the inclination of the magnetic
-field. A simulated device has an orientation but no position, so the specific force
-contains gravity only. A device with `SensorErrors` measures these signals with bias, scale errors
-and noise.
+ω is the angular rate, f the specific force, and m the magnetic field, all in sensor axes. q_k is
+the orientation from sensor to world at time k, R_k its matrix, and log the logarithm of a
+quaternion. T is the time between the two orientations, g the acceleration of gravity, and δ the
+inclination of the magnetic field. A simulated device has an orientation but no position, so the
+specific force contains gravity only. A device with `SensorErrors` measures these signals with bias,
+scale errors and noise.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Virtual LP-Research LPMS sensor of both generations, with LP-BUS on a pseudo-terminal (pty).
 
-Invariant: each generation executes its own commands only. A command of the other generation has the
-effect of its number in this generation. For example, 04 writes the flash of generation 3, and 05
-restores its factory settings. 08 puts generation 1 to sleep, and 16 starts its gyroscope
-calibration. Settings are lost at power-off unless they are stored.
+Invariant: each generation executes its own commands only. If the host sends a command of the other
+generation, the sensor executes its own command with the same number. For example, 04 writes the
+flash of generation 3, and 05 restores its factory settings. 08 puts generation 1 to sleep, and 16
+starts its gyroscope calibration. Settings are lost at power-off unless they are stored.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Virtual MicroStrain device, which sends MIP messages on a pseudo-terminal (pty).
 
-Invariants (as in real devices): settings are volatile until they are saved. A command of the other
-device family is refused. Every field has its own decimation, so some packets contain no time. The
-output of the filter is later than the output of the sensor. A changed line speed takes effect after
-250 ms without data.
+Invariants (as in real devices): settings are volatile until they are saved. A device of the current
+family refuses commands of the legacy family, and vice versa. Every field has its own decimation, so
+some packets contain no time. The output of the filter is later than the output of the sensor. A
+changed line speed takes effect after 250 ms without data.
 """
 
 from __future__ import annotations

@@ -27,8 +27,8 @@ class OrientationSensor:
 
     Here *q* is the true orientation in the base world *W*. :math:`W_s` is the sensor's own world,
     which differs from the base world by a heading, and with a simulated fault also by an
-    inclination. The slow error *e* is on the world side, as in fusion filters, and *n* is white
-    noise.
+    inclination. The slow error *e* is a rotation in world axes, as in fusion filters. The white
+    noise *n* is a rotation in sensor axes.
 
     Parameters
     ----------

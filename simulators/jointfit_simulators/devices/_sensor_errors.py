@@ -25,8 +25,7 @@ class VectorErrors:
     noise_sd: float = 0.0
     """Standard deviation of white noise, in the unit of the vector."""
     limit: float = float("inf")
-    """Limit of the measuring range in both directions. Values outside the range are replaced by the
-    limit."""
+    """Largest magnitude in the measuring range. A larger component is reduced to this magnitude."""
 
     def measure(self, true: Vector, random: Random) -> Vector:
         """Return the measurement of a vector in sensor axes."""

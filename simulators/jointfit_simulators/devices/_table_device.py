@@ -187,8 +187,8 @@ class TableDeviceOptions:
     """Content of the records, and faults."""
 
     fields: Mapping[int, TableField] = field(default_factory=dict)
-    """Format and SI scale of each slot. The position of a field matters in CAN frames and binary
-    frames only."""
+    """Format and SI scale of each number of a record, by slot (see `jointfit_protocols.table`). The
+    position of a field matters in CAN frames and binary frames only."""
     rate_hz: float = 100.0
     world: World = "ENU"
     world_to_sensor: bool = False

@@ -98,7 +98,7 @@ class VrpnServer:
 
     @property
     def clients(self) -> int:
-        """Number of clients that have exchanged cookies."""
+        """Number of clients that have completed the handshake, the exchange of VRPN's cookies."""
         return sum(client.greeted and client.peer.open for client in self._clients)
 
     @property

@@ -231,7 +231,10 @@ class XbusDevice(SerialDevice):
             self._timer.cancel()
 
     def _reply_of_age(self, mid: int, data: bytes) -> tuple[int, bytes] | None:
-        """Return `_reply`, or an error for a request that this age of device does not know."""
+        """Return the reply; requests for the format of another generation yield an error.
+
+        Older devices send MTData, and newer devices send MTData2.
+        """
         options = self._options
         if options.legacy is None:
             unknown = mid in {XbusMessageId.OUTPUT_MODE, XbusMessageId.OUTPUT_SETTINGS}
@@ -308,7 +311,7 @@ class XbusDevice(SerialDevice):
         return self._options.first_tick + (device_ns - self._epoch_ns) // setup.TICK_NS
 
     def _measure(self, ticks: int, q: Quaternion | None) -> bool:
-        """Send one MTData2 message; return whether the whole message was sent."""
+        """Send one message (MTData2, or MTData if legacy); return whether all of it was sent."""
         counter = self.counter
         self.counter = (counter + 1) % _COUNTS
         self._messages += 1

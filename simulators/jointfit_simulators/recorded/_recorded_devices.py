@@ -137,7 +137,7 @@ class RecordedCameras:
     """NatNet server that sends recorded datagrams in unicast on the loopback interface.
 
     The server answers with the recorded name, version, clock frequency and model. Its clock
-    continues the recorded clock, also in the answers to echo requests.
+    continues the recorded clock. The server sends this time in its answers to EchoRequest messages.
 
     Parameters
     ----------

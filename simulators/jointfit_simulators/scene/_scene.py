@@ -74,7 +74,7 @@ class SceneOptions:
     ptp: bool = False
     """Whether cameras and host are synchronized by PTP."""
     command_port: int = 0
-    """UDP port of the motion-capture server; 0 selects a free port."""
+    """Port to which clients of the motion-capture server connect; 0 selects a free port."""
     chain_model: bool = False
     """Whether a chain model of the simulated subject is written and named in rig.toml."""
     planar: bool = False
@@ -288,7 +288,7 @@ class Scene:
 
     @property
     def command_port(self) -> int | None:
-        """UDP port of the motion-capture server; None without a server."""
+        """Port to which clients of the motion-capture server connect; None without a server."""
         return None if self._server is None else self._server.command_port
 
     def command(self, line: str) -> dict[str, object] | None:

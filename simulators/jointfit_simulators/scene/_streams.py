@@ -2,9 +2,8 @@
 
 Samples are planned in blocks (computed in advance) and sent one by one.
 
-Invariant: a sample contains its sampling time, even if it is sent late. Every sample that a
-measuring device takes is counted as sent, as dropped (`Knobs.dropout`), or as refused by a full
-line.
+Invariant: a sample contains its sampling time, even if it is sent late. Every sample is counted
+once: by the device as sent, or by `ImuStream` as dropped out, refused or unheard.
 """
 
 from __future__ import annotations
@@ -107,7 +106,8 @@ class ImuStream:
         self._planned: deque[tuple[int, int, Quaternion | None]] = deque()
         self._edges: deque[int] = deque(maxlen=_MOST_EDGES)
         self.dropped_out = 0
-        """Number of samples that `Knobs.dropout` dropped while the device was measuring."""
+        """Number of samples that a measuring device did not send, because `Knobs.dropout` dropped
+        them or the recorded trial has no orientation."""
         self.unheard = 0
         """Number of samples that were taken while the device was unplugged, paused or not
         measuring, or before the first opening of the port."""

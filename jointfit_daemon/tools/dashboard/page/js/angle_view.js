@@ -7,7 +7,7 @@ import { UNKNOWN, angleName, flagSentence, formatNumber, isMinorFlag, isolate, t
 const NUMBER_MS = 200;
 const STALE_MS = 1500;
 const OPTICAL_GAP_US = 150_000;
-const GAP_PERIODS = 3.5; // a longer pause, in periods of the poses, interrupts the curve
+const GAP_PERIODS = 3.5; // longest pause, in periods of the poses, that does not interrupt the curve
 const MARK = { dash: [4, 4], font: "600 12px system-ui, sans-serif" };
 const HAS_SD = /^(flexion|elevation|inner)_deg$/;
 const STORED_CHOICE = "jointfit-angle";

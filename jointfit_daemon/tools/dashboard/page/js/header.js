@@ -5,7 +5,7 @@ import { recordingState } from "./recording_panel.js";
 import { gatewayNow, poseAgeMs } from "./store.js";
 import { calibrationSentence, formatClock, isRunning } from "./words.js";
 
-const SILENT_MS = 5000; // poses arrive at 10 Hz, with or without sensors
+const SILENT_MS = 5000; // poses arrive with or without sensors, by default at 10 Hz (pose_ui_hz)
 const RETAINED_MS = 1000; // retained messages arrive within this time after a connection
 
 /**

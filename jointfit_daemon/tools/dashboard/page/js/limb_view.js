@@ -7,7 +7,7 @@ import { poseAgeMs, valueOf } from "./store.js";
 import { formatNumber, isolate, titleOf } from "./words.js";
 
 const FRAME_MS = 1000 / 30;
-const DELAY_MS = 110; // longer than a period of pose/ui, because the drawing interpolates between two poses
+const DELAY_MS = 110; // longer than the default period of pose/ui, because the drawing interpolates between two poses
 const STALE_MS = 1500;
 const SIDE_TURN = -0.6;
 const FRONT_TURN = -1.15; // in a view from the side, two legs cover each other

@@ -20,10 +20,10 @@ const OTHER_VERSION = new Set([1, 132]);
 /**
  * Return the link of the page to its broker.
  *
- * `configuration` is from the server. `handlers` has `changed()` for every change of `state`,
- * `connected()` for every connection,
- * `found(base)` for every rig, `message(topic, payload)` for every message of the chosen rig, and
- * `login(reason)` if the broker requires an account.
+ * `configuration` is from the server. `handlers` has callbacks: `changed()` after every change of `state`,
+ * `connected()` after every connection, `found(base, info)` for every rig on the broker,
+ * `message(topic, payload)` for every message of the chosen rig, and `login(reason)` if the broker requires
+ * an account.
  */
 export function createLink(configuration, handlers) {
   const link = {

@@ -18,8 +18,8 @@ export function createMarker(store, request) {
 }
 
 /**
- * Return a form that marks the current time with a text. The text remains selected: Enter repeats it,
- * and typing replaces it. `hint` names the key.
+ * Return a form that marks the current time with a text. The text remains selected, so Enter sends it
+ * again, and typing replaces it. If `hint` is true, the button shows the key M.
  */
 export function createMarkForm(mark, { hint = false } = {}) {
   const text = createElement("input", { maxlength: "200", "aria-label": "Text of the mark", placeholder: "Text of a mark", autocomplete: "off" });
@@ -49,8 +49,9 @@ async function showAnswer(note, answer) {
 }
 
 /**
- * Mark with one key in every view, unless a text field or a dialog has the focus, or the user
- * has disabled the key. The answer appears in the form; if the form is hidden, for some seconds over the page.
+ * Mark the current time at the key M in every view, unless a text field or a dialog has the focus, or the
+ * user has disabled the key. The answer appears in the form. If the form is hidden, the answer also appears
+ * over the page for some seconds.
  */
 export function connectMarkKey(form, mayMark) {
   const box = byId("mark-key");

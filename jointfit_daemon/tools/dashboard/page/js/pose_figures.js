@@ -2,8 +2,8 @@
 
 import { createElement, createSvg } from "./dom.js";
 
-// Joints in a box of 100 by 130; the ground is at y = 122. "limb" has the sensors. "words" are
-// words in the daemon's remedies for which the figure shows the right movement.
+// Joints in a box of 100 by 130; the ground is at y = 124. "limb" is the part of the body with the sensors.
+// "words" are words in the daemon's remedies for which the figure shows the right movement.
 const FIGURES = {
   plate: {
     label: "Turn about three axes",
@@ -121,7 +121,7 @@ function drawFigure(figure) {
 
 const sensor = (x, y, turn = 0) => createSvg("rect", { class: "sensor", x: x - 3.5, y: y - 3.5, width: 7, height: 7, rx: 2, transform: `rotate(${turn} ${x} ${y})` });
 
-/** Return a path with a head at its end; the head follows from the last two numbers of the path. */
+/** Return an arrow along a path; the last two numbers of the path are the tip of the arrow. */
 function arrow(path) {
   const group = createSvg("g", { class: "motion" }, createSvg("path", { d: path }));
   const numbers = path.match(/-?[\d.]+/g).map(Number);

@@ -45,7 +45,7 @@ export function createRequests(link, now) {
         if (published?.reasonCode === NOT_AUTHORISED) throw new Error(NO_RIGHT);
       } catch (error) {
         waiting.delete(transaction);
-        answered.catch(() => undefined); // the time limit rejects it later
+        answered.catch(() => undefined); // the time limit rejects `answered` later; the rejection is expected
         throw error.message === NO_RIGHT ? error : new Error(NO_RIGHT);
       }
       return answered;
