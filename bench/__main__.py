@@ -28,8 +28,7 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).resolve().parents[1]
 SINGLE_THREAD = {"OPENBLAS_NUM_THREADS": "1"}
-"""Environment variables for speed experiments; the systemd units of the daemon and its fits have
-the same values."""
+"""Environment variables for speed experiments. The daemon's systemd units set the same value."""
 
 Measured = list[tuple[Experiment, list[Result]]]
 
@@ -89,7 +88,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("ids", nargs="*", metavar="ID", help="experiments to run at full length")
     parser.add_argument("--full", action="store_true", help="all experiments, about an hour")
     parser.add_argument("--topic", metavar="NAME", help="the experiments of one topic")
-    parser.add_argument("--quick", action="store_true", help="the short form, where there is one")
+    parser.add_argument("--quick", action="store_true", help="run the short forms where they exist")
     parser.add_argument("--list", action="store_true", help="print IDs, topics and titles")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results to FILE")
     parser.add_argument("--dry-run", action="store_true", help="run, but store no results or pages")
@@ -100,7 +99,7 @@ def _parser() -> argparse.ArgumentParser:
 def run_all(
     chosen: Sequence[Experiment], *, quick: bool, single_thread: bool = False
 ) -> Iterator[tuple[Experiment, list[Result]]]:
-    """Run experiments in order; speed experiments run in their own process with one BLAS thread."""
+    """Run experiments in order; speed experiments run last, in one process with one BLAS thread."""
     fast = [] if single_thread else [e for e in chosen if e.topic == "speed"]
     for experiment in chosen:
         if experiment not in fast:

@@ -1,1 +1,1 @@
-"""Estimators that serve as baselines only."""
+"""Estimators, bounds and formulas that experiments and tests compare with the daemon's results."""

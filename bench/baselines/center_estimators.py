@@ -1,8 +1,8 @@
-"""Hip and knee centers of recorded trials, estimated and compared with the centers of a model.
+"""Hip and knee centers estimated from recorded trials, compared with a musculoskeletal model.
 
 Invariant: the estimators receive only the markers of two neighbouring segments: no static trial, no
-regression equation, no model. An error is the distance between an estimate and the mean center of
-the model, in the coordinates of the parent segment.
+regression equation, no model. An error is the distance between an estimate and the mean position of
+the model's joint center, in the coordinates of the parent segment.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _GAIT = ("Upper", "Front", "Rear")
 
 @dataclass(frozen=True, slots=True)
 class ModelJoint:
-    """Joint to estimate, with its name in the model and the markers of its two segments."""
+    """Joint to estimate: its name, its name in the model, and the markers of its two segments."""
 
     name: str
     model: str
@@ -52,8 +52,8 @@ class EstimatedCenters:
     model: NDArray[np.float64]
     """Mean center of the model over its frames, in parent coordinates, m."""
     wander: float
-    """RMS distance of the model's center from its mean position, m; the cause is soft-tissue
-    artefact."""
+    """RMS distance of the model's center from its mean position, m. Soft-tissue artefact moves the
+    parent's markers, and therefore the center in parent coordinates."""
     estimates: dict[str, CenterEstimate]
     """Estimates, by method."""
 
@@ -79,7 +79,7 @@ class EstimatedCenters:
 
 
 def hinge(reduced: ParentFrameMotion) -> NDArray[np.float64]:
-    """Return the main axis of rotation of the child, in parent coordinates."""
+    """Return the main axis about which the child rotates: a unit vector in parent coordinates."""
     points = reduced.movement.points
     assert points is not None
     whole = points[np.isfinite(points).all(axis=(1, 2))]
@@ -115,7 +115,7 @@ def gait_joints() -> tuple[ModelJoint, ...]:
 
 @cache
 def judged(data: Path, trial: str, methods: tuple[str, ...]) -> tuple[EstimatedCenters, ...]:
-    """Estimate all joints of a trial: ``gait2354`` or one of `OPENCAP`."""
+    """Estimate all joints of `trial`, which is ``gait2354`` or one of `OPENCAP`."""
     if trial == "gait2354":
         model, joints = gait2354(data), gait_joints()
     else:

@@ -1,7 +1,8 @@
-"""Theory of circle centers for experiments and tests: bounds, and errors of centers from 3 frames.
+"""Theory of circle centers: Cramér-Rao bounds, and errors of centers computed from three frames.
 
-A bound depends on the movement and the noise only. It is infinite if the movement contains no
-information about the center.
+The bound is the smallest variance of an unbiased estimate. It depends on the movement and the
+noise, but not on the estimator. It is infinite if the movement contains no information about the
+center.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ def circle_bound(angles: ArrayLike, noise: float, *, known_radius: bool = False)
     .. math:: C = \sigma^2 \Big[ \sum_i u_i u_i^T \Big]^{-1}_{xy},
               \qquad u_i = (\cos\theta_i, \sin\theta_i, 1)
 
-    Here θ_i is angle i, and σ is `noise`. If the radius is known, the 1 is omitted.
+    Here θ_i is angle i, and σ is `noise`. If the radius is known, u_i does not contain the 1.
 
     Parameters
     ----------
@@ -57,7 +58,7 @@ def circle_rms_bound(angles: ArrayLike, noise: float, *, known_radius: bool = Fa
 
 
 def arbitrary_error(angles: ArrayLike, noise: ArrayLike) -> Array:
-    r"""Predict the RMS error of a center from three frames, given their three angles.
+    r"""Predict the RMS error of a center that is computed from one marker in three frames.
 
     .. math::
         E^2 = \frac{2\sigma^2 (3 - \cos\theta_{12} - \cos\theta_{13} - \cos\theta_{23})}
@@ -88,11 +89,12 @@ def arbitrary_error(angles: ArrayLike, noise: ArrayLike) -> Array:
 
 
 def triangle_error(points: ArrayLike, noise: ArrayLike) -> Array:
-    r"""Predict the RMS error of a center from three frames, given only the measured triangle.
+    r"""Predict the same error as `arbitrary_error`, from the measured positions instead of angles.
 
     .. math:: E = \sigma \frac{R}{2A} \sqrt{a^2 + b^2 + c^2}, \qquad R = abc / 4A
 
-    Here a, b and c are the sides of the triangle, A is its area, and σ is `noise`.
+    Here a, b and c are the sides of the triangle of the three positions, A is its area, R is the
+    radius of the circle through the positions, and σ is `noise`.
 
     Parameters
     ----------
@@ -121,9 +123,10 @@ def _ratio(above: Array, below: Array) -> Array:
 
 
 def combine(estimates: list[CenterEstimate]) -> tuple[Array, Array]:
-    r"""Combine the centers of independent markers, weighted by information.
+    r"""Combine estimates of one center from markers with independent errors.
 
-    Outliers are not rejected. Estimates with an unobserved direction are ignored.
+    The weights are the inverse covariances. Outliers are not rejected. Estimates with an unobserved
+    direction are ignored.
 
     .. math:: C = \Big( \sum_k C_k^{-1} \Big)^{-1}, \qquad c = C \sum_k C_k^{-1} c_k
 

@@ -29,7 +29,10 @@ METHODS = ("single", "mean", "markley", "patent6", "patent12", "linear", "anchor
 
 
 class SegmentInputs(NamedTuple):
-    """Orientations of the sensors, the neighbour and the bone (reference), shape (n, 4) each."""
+    """Orientations for one segment, shape (n, 4) each: sensors, neighbouring segment, bone.
+
+    The bone is the reference.
+    """
 
     sensors: list[Array]
     other: Array
@@ -37,7 +40,7 @@ class SegmentInputs(NamedTuple):
 
 
 def segments(trial: KneeTrial) -> tuple[SegmentInputs, SegmentInputs]:
-    """Return the inputs of thigh and shank; each uses the mean of its neighbour's sensors."""
+    """Return the inputs of thigh and shank; `other` is the mean of the neighbour's sensors."""
     a, b, c, d = trial.sensors
     thigh, shank = fuse([a, b], (0.5, 0.5)), fuse([c, d], (0.5, 0.5))
     return SegmentInputs([a, b], shank, trial.thigh), SegmentInputs([c, d], thigh, trial.shank)
@@ -60,7 +63,7 @@ def models(trials: Sequence[KneeTrial], method: str = "anchored") -> tuple[Segme
 
 
 def correlation(trials: Sequence[KneeTrial]) -> float:
-    """Return the correlation between the default method's errors of thigh and shank about x."""
+    """Return the correlation between the errors of thigh and shank about x, default method."""
     return error_correlation(*_training(trials))
 
 

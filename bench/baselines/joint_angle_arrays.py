@@ -23,17 +23,20 @@ class AngleSequence(NamedTuple):
     angles: Array
     """Joint angles, rad, shape (..., 3)."""
     gimbal: NDArray[np.bool_]
-    """Whether the first and last angle are not separable, shape (...)."""
+    """Whether the frame is in gimbal lock, where only the sum or the difference of the first and
+    the last angle is determined; shape (...)."""
 
 
 def patent_angles(q_joint: ArrayLike) -> AngleSequence:
-    r"""Return the patent's angles (alpha, beta, gamma), R = Rz(gamma) Ry(beta) Rx(alpha).
+    r"""Return the patent's angles (alpha, beta, gamma) of R = Rz(gamma) Ry(beta) Rx(alpha).
+
+    R is the matrix of `q_joint` = (q_0, q_1, q_2, q_3), scalar first.
 
     .. math:: \alpha = \mathrm{atan2}(2(q_0 q_1 + q_2 q_3), 1 - 2(q_1^2 + q_2^2)),\;
               \beta = \arcsin 2(q_0 q_2 - q_3 q_1),\;
               \gamma = \mathrm{atan2}(2(q_0 q_3 + q_1 q_2), 1 - 2(q_2^2 + q_3^2))
 
-    The function ``read_patent`` processes one frame of plain tuples.
+    The daemon uses ``read_patent``, which computes the same angles for one frame.
     """
     w, x, y, z = np.moveaxis(np.asarray(q_joint, dtype=np.float64), -1, 0)
     alpha = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
@@ -42,7 +45,7 @@ def patent_angles(q_joint: ArrayLike) -> AngleSequence:
 
 
 def grood_suntay(q_joint: ArrayLike) -> AngleSequence:
-    r"""Return (phi, theta, psi) of R = Rx(phi) Ry(theta) Rz(psi).
+    r"""Return (phi, theta, psi) of R = Rx(phi) Ry(theta) Rz(psi), the matrix of `q_joint`.
 
     .. math:: \phi = \mathrm{atan2}(-R_{12}, R_{22}),\; \theta = \arcsin R_{02},\;
               \psi = \mathrm{atan2}(-R_{01}, R_{00})

@@ -4,8 +4,9 @@ r"""Baseline: a linear soft-tissue correction of the weighted mean, without kern
 .. math:: \hat q = f_0 \otimes \exp(\eta\, \mathrm{clip}(C^T \varphi))
 
 Here :math:`f_0` is the weighted mean of the sensors of a segment, and :math:`\varphi` are the
-relative rotations from `features`. C is a robust ridge fit of :math:`\rho = \log(f_0^* \otimes
-q_{ref})`. Outside the training range, the correction fades (:math:`\eta`).
+regressors from `features`. C is a robust ridge fit of :math:`\rho = \log(f_0^* \otimes q_{ref})`,
+where :math:`q_{ref}` is the reference. The factor :math:`\eta` is 1 in the training range and
+decreases outside it.
 """
 
 from __future__ import annotations
@@ -73,8 +74,8 @@ class LinearCorrection(SegmentModel):
     """Mean outer product of held-out residuals, rad^2, 3x3, segment axes."""
     residual_sd: float
     mean_sd: float
-    """RMS error of the uncorrected mean in training, rad per axis. It applies without a
-    neighbouring segment."""
+    """RMS error of the uncorrected mean in training, rad per axis. It is the standard deviation of
+    a frame without an orientation of the neighbouring segment."""
     penalty: float
     movements: int
     """Number of movements in training."""
@@ -87,7 +88,7 @@ class LinearCorrection(SegmentModel):
 
     @override
     def predict(self, sensors: Sequence[ArrayLike], q_other: ArrayLike | None = None) -> Array:
-        """Return the corrected mean, shape (n, 4); the plain mean without a neighbour."""
+        """Return the corrected mean, shape (n, 4); the uncorrected mean if `q_other` is None."""
         inputs = [np.asarray(q, dtype=np.float64) for q in sensors]
         mean = fuse(inputs, self.weights)
         if q_other is None:
@@ -180,7 +181,7 @@ def features(sensors: Sequence[Array], q_other: Array) -> Array:
 
     Here :math:`k = \log(x^* \otimes o)` is the joint rotation between the first sensor x and the
     neighbour o. :math:`d_j = \log(x^* \otimes y_j)` is the rotation from the first sensor to
-    sensor :math:`y_j`. Both are in rad.
+    sensor :math:`y_j`. k and :math:`d_j` are in rad. :math:`\circ` is the product of components.
 
     Parameters
     ----------

@@ -130,9 +130,9 @@ def _moving_spread(samples: ArrayLike, size: int) -> NDArray[np.float64]:
 
 
 def _moving_mean(values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Return the means of `size` rows centered at each row; beyond the ends, the end row counts.
+    """Return the means of `size` rows centered at each row.
 
-    The means are computed from running sums.
+    Rows beyond the ends are replaced by the end row. The means are computed from running sums.
     """
     before = size // 2
     padded = np.pad(values, ((before + 1, size - 1 - before), (0, 0)), mode="edge")

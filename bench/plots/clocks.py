@@ -165,7 +165,7 @@ def _rate_and_gaps(trace: Trace, name: str, color: str, rate: Axes, gaps: Axes) 
 def delays(trace: Trace, about: SimulatedRun) -> Figure:
     """Draw arrival time minus stamp, which is the delay in excess of the minimum delay.
 
-    For cameras that answer echo requests, it is the delay since the exposure.
+    For cameras whose server answers echo requests, the value is the delay since the exposure.
     """
     names = sorted(trace.stamps)
     figure = Figure(figsize=(11, 1.1 + 1.5 * len(names)), layout="constrained")
@@ -240,7 +240,7 @@ def _latency(axis: Axes, trace: Trace) -> None:
 
 
 def lags(trace: Trace, about: SimulatedRun) -> Figure:
-    """Draw the lag windows of every sensor with their sigmas; crosses are rejected windows."""
+    """Draw the lag of each window with two standard deviations; crosses are rejected windows."""
     names = sorted(trace.lags)
     figure = _figure("Lag of the IMU after the cameras, windows of 10 s, ± 2 sigma",
                      [f"{name}, ms" for name in names] or ["no optical bodies"], about)  # fmt: skip

@@ -1,1 +1,1 @@
-"""The daemon, simulators and a broker as processes; the core with recorded events."""
+"""Set-ups of experiments: daemon, simulators and broker as processes, or the core with events."""

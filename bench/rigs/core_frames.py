@@ -1,9 +1,9 @@
-"""Core without time measurement: ``python -m bench.rigs.core_frames CALIBRATION FRAMES``.
+"""Process that runs the core: ``python -m bench.rigs.core_frames CALIBRATION FRAMES``.
 
-The bytes of four IMUs at 100 Hz are converted to poses as JSON. The start of every run costs the
-same, so the difference between two runs is the cost of the additional frames. `CALIBRATION` is a
-file with a calibration of the simulated subject. It is not fitted here, because a fit takes long in
-an emulation.
+The core converts the bytes of four IMUs at 100 Hz to poses as JSON. An emulator counts the machine
+instructions of the process. The start of every run has the same cost, so the difference between two
+runs is the cost of the additional frames. `CALIBRATION` is a file with a calibration of the
+simulated subject, because a fit would take long in the emulator.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Live rig with drifting clocks and device restarts, which measures the error of every stamp.
+"""Running daemon whose simulated devices have drifting clocks and restart one after another.
+
+The error of every stamp is measured.
 
 Invariant: three processes exchange only bytes: simulated devices (NatNet, two IMUs on UARTs, two on
 CAN), the daemon, and a broker. The devices reboot one after another, each after all devices have

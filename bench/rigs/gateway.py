@@ -294,7 +294,7 @@ async def _last_health(heard: ReceivedMessages) -> dict[str, Any]:
 def unaccounted(sent: dict[str, int], devices: dict[str, dict[str, Any]]) -> int:
     """Return the number of samples that were not received, or that have no outcome.
 
-    Dropped samples have an outcome, so they do not count.
+    Dropped samples have an outcome, so this number does not contain them.
     """
     lost = 0
     for name, device in devices.items():

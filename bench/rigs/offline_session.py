@@ -1,10 +1,10 @@
 """Session of recorded movements with offline fit and fusion, without bytes, clocks or messages.
 
-Invariant: only the times of the frames are from the daemon. The sensors have their recorded
-orientations at exactly these times. The models are fitted as `jointfit fuse fit` does. The sensors
-are fused frame by frame as `jointfit fuse apply` does, including the correction of headings and
-sensor pairs. The session includes the rest before the movement, from which the daemon determines
-the headings, and the gaps of the recording.
+Invariant: the offline run uses the times of the daemon's frames, but no other output of the daemon.
+The sensors have their recorded orientations at exactly these times. The models are fitted as
+`jointfit fuse fit` does. The sensors are fused frame by frame as `jointfit fuse apply` does,
+including the correction of headings and sensor pairs. The session includes the rest before the
+movement, from which the daemon determines the headings, and the gaps of the recording.
 """
 
 from __future__ import annotations

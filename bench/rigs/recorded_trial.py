@@ -337,7 +337,7 @@ def _in_bone_frames(
 
 
 def _repeated_deg(running: Gateway) -> float | None:
-    """Evaluate step S4 of the patent from the messages alone, see `Played.repeated_deg`."""
+    """Compute the patent's fusion (step S4) from the messages alone, see `Played.repeated_deg`."""
     largest = None
     for pose in running.poses:
         sensors = running.sensors.get(pose["seq"], {})

@@ -1,10 +1,11 @@
-"""Process that records four sensors at 400 Hz and limb states at 100 Hz, until it is killed.
+"""Process that records four sensors at 400 Hz and limb states at 100 Hz.
 
     python -m bench.rigs.recording_process FOLDER [--seconds S] [--file-seconds S] [--stamps]
         [--without-recorder]
 
-It prints ``ready`` when the input starts, and its cost as JSON at its end. With ``--stamps``, it
-also prints the arrival time of the last chunk ten times per second, CLOCK_MONOTONIC ns.
+The process ends after S seconds, or when it is killed. It prints ``ready`` when the input starts,
+and its cost as JSON at the end. With ``--stamps``, it also prints the time (CLOCK_MONOTONIC, ns)
+ten times per second, so that a reader knows what was recorded before a kill.
 """
 
 from __future__ import annotations

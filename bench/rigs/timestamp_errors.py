@@ -202,7 +202,8 @@ class ObservedCore(Core):
 
 
 def unexcused(error_ns: int, excused_ns: int) -> int:
-    """Return the absolute error without its excused part; only a late stamp has such a part."""
+    """Return the absolute error without its excused part, which only stamps after the true time
+    have."""
     return max(-error_ns, error_ns - excused_ns, 0)
 
 

@@ -58,7 +58,7 @@ class SubjectRecording:
 
 @cache
 def calibrated(seed: int) -> Calibration | None:
-    """Return the calibration of one subject; None if the daemon would request another pose."""
+    """Return the calibration of one subject; None if the calibration is refused."""
     rig, trials = bench_rig(), phases(seed)
     alignment = fit_plate_alignment(trials.align, rig.calibration)
     try:
@@ -71,7 +71,7 @@ def calibrated(seed: int) -> Calibration | None:
 
 @cache
 def live(seed: int, seconds: float, rate_hz: float, begin_s: float = BEGIN_S) -> SubjectRecording:
-    """Return the recording of walking, squats, sitting down and up, and standing, in turn."""
+    """Return the recording of walking, squats, sit-to-stand and standing, in turn."""
     knobs = Knobs(seed=seed)
     count = -(-int(seconds) // int(MOVE_S))
     steps = [Step(MOVES[k % len(MOVES)], MOVE_S) for k in range(count)]

@@ -29,7 +29,7 @@ class Runs:
     covariances: Array
     conditioning: Array
     bound: float
-    """Bound of the RMS error, m."""
+    """Cramér-Rao bound of the RMS error, m."""
 
     @property
     def published(self) -> NDArray[np.bool_]:
@@ -64,7 +64,8 @@ def runs_on(
 ) -> Runs:
     """Return the fits of `runs` noisy arcs of `n` equidistant points over `arc` degrees.
 
-    Both ends of an arc are points. `noise` is the standard deviation of a coordinate, m.
+    Both ends of an arc are points. `noise` is the standard deviation of a coordinate, m. With
+    `tempered`, the centers are shrunk estimates: moved towards the points by the predicted bias.
     """
     rng = np.random.default_rng(round(1000 * arc) + n)
     t = np.linspace(-0.5, 0.5, n) * np.deg2rad(arc)

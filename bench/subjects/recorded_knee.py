@@ -1,7 +1,8 @@
-"""Recorded knee: soft-tissue artefact and filter errors of four virtual sensors, and a bone model.
+"""Recorded knee: four virtual sensors of one leg, and the orientations of its bones in a model.
 
-The module loads `semireal_knee4imu` in the conventions of the project. It computes errors in the
-same way as the tables of that data set.
+The module loads the data set `semireal_knee4imu`, converted to the conventions of the project. The
+virtual sensors contain soft-tissue artefact of skin markers and recorded errors of orientation
+filters. The module computes errors in the same way as the tables of the data set.
 """
 
 from __future__ import annotations
@@ -29,7 +30,10 @@ TRAINING_SHARE = 0.6
 
 @dataclass(frozen=True, slots=True)
 class KneeTrial:
-    """Frames of one movement with all markers; `thigh` and `shank` are the reference, (n, 4)."""
+    """Frames of one movement in which all orientations are known.
+
+    `thigh` and `shank` are the reference, q_world_segment, shape (n, 4).
+    """
 
     sensors: tuple[Array, Array, Array, Array]
     """Bone-aligned orientations q_world_segment of S1 and S2 (thigh) and S3 and S4 (shank), shape

@@ -1,9 +1,10 @@
 """Both legs of a recorded adult, with eight assignments of filter errors and two references.
 
-The module loads `semireal_knee4imu_v2`, which contains soft-tissue artefact. The two references are
-solutions of the same model, with fitted marker positions and with those of the static trial. They
-differ by up to 20 deg about the long axis of the thigh. If only one reference shows an improvement,
-the method may only fit the error of that reference.
+The module loads the data set `semireal_knee4imu_v2`, which contains soft-tissue artefact. Both
+references are inverse kinematics of the same model: one with fitted marker positions, one with the
+marker positions of the static trial. The references differ by up to 20 deg about the long axis of
+the thigh. If only one reference shows an improvement, the method may only fit the error of that
+reference.
 """
 
 from __future__ import annotations

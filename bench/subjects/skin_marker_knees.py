@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 SUBJECT = "opencap_subject4"
 MODEL = "optimized_scale_and_markers.osim"
 MOVEMENTS = {"squats1": 2, "walking1": 1, "DJ1": 1, "STS1": 2}
-"""Step between used frames at 100 Hz, by movement, as in the recorded knee."""
+"""Step between used frames at 100 Hz, by movement, as in `bench.subjects.recorded_knee`."""
 STATIC, STATIC_EVERY = "static1", 20
 RATE_HZ = 100.0
 CLUSTERS = ("thigh", "sh1", "sh2", "sh3", "sh4", "shank")
@@ -62,7 +62,7 @@ the static trial would differ from the bones of the other trials.
 
 
 AS_RECORDED = (0, 1, 2, 3)
-"""Index of the filter error of each sensor, as in the recorded knee."""
+"""Index of the filter error of each sensor, as in `bench.subjects.recorded_knee`."""
 
 
 class _Leg(NamedTuple):

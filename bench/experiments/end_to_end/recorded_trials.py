@@ -26,7 +26,8 @@ METHODS: tuple[Method, ...] = ("mean", "patent12", "patent6", "anchored")
 WALKERS: tuple[Method, ...] = ("patent12", "patent6", "anchored")
 ALLOWED_DEG = 0.1
 REPEATED_DEG = 0.01
-"""Largest accepted `Played.repeated_deg`, deg: difference of poses from the patent's regression."""
+"""Largest accepted angle, deg, between the segments in ``pose`` and the patent's regression that is
+evaluated from other messages (`Played.repeated_deg`)."""
 
 
 @cache

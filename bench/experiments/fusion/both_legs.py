@@ -1,7 +1,8 @@
 """Fusion on both legs: sit-to-stand, left-out movements, coverage, and the static pose.
 
-The trials of `skin_marker_knees` show the subject of the recorded knee. Their poses are from the
-inverse kinematics of this project. They add the left leg and sit-to-stand.
+The trials are from `bench.subjects.skin_marker_knees`, and the subject is the subject of
+`bench.subjects.recorded_knee`. The reference poses are computed by this project's inverse
+kinematics. In addition to the recorded knee, the trials contain the left leg and sit-to-stand.
 """
 
 from __future__ import annotations
@@ -41,15 +42,15 @@ if TYPE_CHECKING:
 
 SIDES = {"right": "r", "left": "l"}
 EXCHANGED = (AS_RECORDED, (1, 2, 3, 0), (3, 0, 1, 2), (2, 3, 0, 1), (1, 0, 3, 2))
-"""Assignments of the recorded filter errors to the sensors."""
+"""Five assignments of the four recorded errors of orientation filters to the four sensors."""
 RIVALS = ("mean", "patent12", "linear", DEFAULT)
 DEEP_DEG = 40.0
 
 
 def sit_to_stand(data: Path) -> list[Result]:
-    """Train on 60 % of the squats, walking and the jump; evaluate on sit-to-stand.
+    """Train on 60 % of the squats, on walking and on the drop jump; evaluate on sit-to-stand.
 
-    No result of the default method may be worse than the mean of two sensors or patent12.
+    No error of the default method may be larger than the smaller error of `mean` and `patent12`.
     """
     figures = []
     for side, trials in _both(data).items():
@@ -66,8 +67,8 @@ def sit_to_stand(data: Path) -> list[Result]:
 def exchanged(data: Path) -> list[Result]:
     """Measure the errors of `sit_to_stand` with five assignments of filter errors to sensors.
 
-    The recordings assign one filter error to each sensor. This assignment is arbitrary. RMS and
-    median must not exceed those of the mean of two sensors or of patent12.
+    The recordings assign one filter error to each sensor. This assignment is arbitrary. The RMS and
+    the median over the assignments must not exceed the values of the methods mean and patent12.
     """
     figures = []
     for side in SIDES:
@@ -112,8 +113,8 @@ def left_out(data: Path) -> list[Result]:
 def coverage(data: Path) -> list[Result]:
     """Measure the coverage of flexion errors on both legs, for all movements.
 
-    The first part evaluates left-out movements. The second part evaluates the last 40 % of each
-    movement after training on the first 60 % of all four. Median and smallest share are over
+    The first part trains on three movements and evaluates the fourth. The second part trains on the
+    first 60 % of all four movements and evaluates the rest. Median and smallest share are over
     movements and legs.
     """
     unseen, later = [], []
@@ -138,8 +139,9 @@ def standing(data: Path) -> list[Result]:
     """Measure the errors in the static pose of the recorded subject, in natural stance.
 
     In natural stance, the bones lean and the knees are slightly flexed. The sensor-to-segment
-    alignments make the mean equal to the reference, so any correction is an error. The methods are
-    trained on squats, and on the part of the squats with larger flexion alone.
+    alignments make the mean of the sensors equal to the reference in this pose, so any correction
+    is an error. Each method is trained twice: on all frames of the squats, and on the frames with a
+    knee rotation above `DEEP_DEG`.
     """
     figures = []
     for side, trials in _both(data).items():
@@ -167,7 +169,7 @@ def _both(data: Path, errors_of: tuple[int, ...] = AS_RECORDED) -> dict[str, dic
 
 
 def _risen(trials: dict[str, KneeTrial]) -> dict[str, Errors]:
-    """Return the errors in sit-to-stand after training on 60 % of squats, walking and jump."""
+    """Return the errors in sit-to-stand, trained as described in `sit_to_stand`."""
     squats = trials["squats1"]
     begin = squats.part(slice(0, training_frames(squats)))
     taught = [begin, trials["walking1"], trials["DJ1"]]

@@ -1,6 +1,6 @@
-"""Rotation of the knee, and its errors divided by the predicted standard deviation.
+"""Errors of the knee rotation, and segment errors divided by their predicted standard deviation.
 
-Invariant: recordings, training and hold-out are the same as in the experiments on segments.
+Invariant: recordings, training and hold-out are the same as in `knee_segments`.
 """
 
 from __future__ import annotations
@@ -29,15 +29,17 @@ JOINT_GOALS = {"hold-out": 1.2, "walking": 3.0, "drop jump": 4.3}
 NORMALIZED = (0.5, 1.3)
 EQUAL = (0.5, 0.5)
 ROTATIONS = 3
-"""Number of rotations in a fit: the joint rotation from the sensor means, and deviations among the
-sensors of each segment."""
+"""Number of rotations that are regressors of the joint fit: the joint rotation from the sensor
+means, and for each segment the rotation between its two sensors."""
 
 
 def joint_itself(data: Path) -> list[Result]:
-    """Measure the RMS error of the joint rotation, from both segments and from a joint fit.
+    """Measure the RMS error of the knee rotation, computed in two ways.
 
-    The knee of the reference is a hinge, so adduction and rotation are functions of flexion. A fit
-    to the joint learns these functions, which a real knee does not have.
+    The first way computes the rotation from the fused orientations of thigh and shank. The second
+    way is a joint fit: a regression that corrects the knee rotation itself. The knee of the
+    reference is a hinge, so adduction and rotation are functions of flexion. The joint fit learns
+    these functions, which a real knee does not have.
     """
     squats = Squats(data)
     judged = {
@@ -65,7 +67,7 @@ def joint_itself(data: Path) -> list[Result]:
 
 
 def normalized_errors(data: Path) -> list[Result]:
-    """Measure the RMS ratio of error to predicted standard deviation, for three movements."""
+    """Measure the RMS ratio of segment error to predicted standard deviation, three movements."""
     squats = Squats(data)
     walk, jump = load(data, "walking1"), load(data, "DJ1")
     models = fusion_methods.models([squats.training, walk, jump])
@@ -85,9 +87,9 @@ def normalized_errors(data: Path) -> list[Result]:
 
 
 def _joint(trial: KneeTrial) -> tuple[Array, Array, Array]:
-    """Return the regressors of a joint fit, and two joint rotations.
+    """Return the regressors of the joint fit, shape (n, 9), and two knee rotations, shape (n, 4).
 
-    One rotation is from the sensor means, and the other is from the reference.
+    The first rotation is between the sensor means, the second between the reference orientations.
     """
     a, b, c, d = trial.sensors
     seen = joint_rotation(fuse([a, b], EQUAL), fuse([c, d], EQUAL))

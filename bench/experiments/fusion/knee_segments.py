@@ -1,7 +1,8 @@
-"""Two sensors per segment on the recorded knee: baselines, default, and degraded cases.
+"""Segment errors on the recorded knee: baselines, the default method, and fewer sensors.
 
-The data are from one leg of one subject, with virtual sensors made of skin markers and a model as
-reference. The results detect regressions; they do not validate the product.
+The data are from one leg of one subject. Virtual sensors are computed from skin markers, two for
+each segment; the reference is a musculoskeletal model. The results detect regressions of the
+program. They do not validate it.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ THIGH, SHANK = (0, 1), (2, 3)
 class KneeModels:
     """Models of both segments, for one method and one selection of sensors.
 
-    Each segment uses the mean of the sensors on its neighbour, as in a rig.
+    The model of a segment also receives the mean of the sensors on the neighbouring segment, like
+    the models of the daemon.
     """
 
     def __init__(
@@ -66,7 +68,7 @@ def _mean_of(sensors: Sequence[Array], chosen: tuple[int, ...]) -> Array:
 
 
 class Squats:
-    """The squats, split into training and hold-out, and the error metric."""
+    """The squats, split into training (first 60 %) and hold-out, and their error computation."""
 
     def __init__(self, data: Path) -> None:
         whole = load(data, "squats1")
@@ -127,7 +129,7 @@ def _untrained(name: str, goals: tuple[float, ...]) -> Callable[[Path], list[Res
 
 
 def three_movements(data: Path) -> list[Result]:
-    """Train on squats, walking and jump together."""
+    """Train on squats, walking and drop jump; measure the errors in the held-out squats."""
     squats = Squats(data)
     trials = [squats.training, load(data, "walking1"), load(data, "DJ1")]
     models = KneeModels("anchored", trials)
@@ -135,7 +137,7 @@ def three_movements(data: Path) -> list[Result]:
 
 
 def facing_elsewhere(data: Path) -> list[Result]:
-    """Measure the largest change of an orientation if the subject faces another direction."""
+    """Measure the largest change of a fused orientation if the subject faces another direction."""
     squats = Squats(data)
     models = KneeModels("anchored", [squats.training])
     straight = models.predict(squats.held)
@@ -150,7 +152,7 @@ def facing_elsewhere(data: Path) -> list[Result]:
 
 
 def one_sensor(data: Path) -> list[Result]:
-    """Measure the errors of the models for single sensors, which apply if the other one is lost."""
+    """Measure the errors of the models for one sensor, which apply if the other sensor is lost."""
     squats = Squats(data)
     figures = []
     for index, goals in ((0, (1.5, 1.9)), (1, (2.1, 2.0))):
@@ -201,7 +203,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "knee-heading-invariance",
-        "Errors in held-out squats with the subject turned by 10 to 180° after the training",
+        "Change of the orientations in held-out squats if the subject is turned by 10 to 180°",
         facing_elsewhere,
         KNEE,
         _DATA,

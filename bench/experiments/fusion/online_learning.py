@@ -1,10 +1,11 @@
-"""Online learning: subjects are calibrated mostly on walking, then squat and sit down.
+"""Online learning of squats and sit-to-stand, after a calibration mostly on walking.
 
-The subjects are simulated with the settings of the demo. The ground truth is their bones, which no
-fit receives. The calibration uses 15 s of mixed movement (walking, hip circles, squats and knee
-swings) and 40 s of walking. Squats and sit-to-stand are learned in three
-rounds. The evaluation uses later repetitions of these two movements, and of walking to detect
-forgetting. Errors are RMS values of a subject. Segment errors include heading drift.
+The subjects have the default settings of the simulator. The ground truth is the motion of their
+bones, which no fit receives. The calibration uses 15 s of mixed movement (walking, hip circles,
+squats and knee swings) and 40 s of walking. Online learning then refits the models in three rounds
+of squats and sit-to-stand. The evaluation uses later repetitions of these two movements. It also
+uses later walking, whose error increases if the refits lose what was learned on walking. An error
+is the RMS value of one subject. Segment errors include heading drift.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ ROUND_S = 80.0
 TURN_DEG = 15.0
 """Rotation of each sensor on the skin at re-donning, deg."""
 OTHER_SKIN = 0.25
-"""Standard deviation of the relative change of the soft-tissue artefact at the new position."""
+"""Relative change of the soft-tissue artefact at re-donning, standard deviation per axis."""
 PLAN = (
     Step("plate", 24.0), Step("stand", 9.0), Step("functional", 15.0), Step("walk", 40.0),
     *(Step(name, 20.0) for _ in range(ROUNDS) for name in ("squat", "sit_to_stand") * 2),
@@ -76,7 +77,7 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Person:
-    """Trials of one subject."""
+    """Simulated signals of one subject over the whole `PLAN`."""
 
     t_s: Array
     said: dict[str, Array]
@@ -85,7 +86,7 @@ class Person:
     flexion: Array
 
     def trial(self, begin_s: float, end_s: float) -> CalibrationTrial:
-        """Return the trial that a calibration phase records."""
+        """Return the trial that a calibration phase would record in this period."""
         now = (self.t_s >= begin_s) & (self.t_s < end_s)
         t_ns = np.round(self.t_s[now] * NS_PER_S).astype(np.int64)
         shot = (self.optical.t_ns >= begin_s * NS_PER_S) & (self.optical.t_ns < end_s * NS_PER_S)
@@ -105,7 +106,7 @@ def _cut(track: OpticalTrack, rows: NDArray[np.bool_]) -> OpticalTrack:
 
 @cache
 def person(seed: int) -> Person:
-    """Return one subject."""
+    """Simulate the subject with this random seed."""
     knobs = Knobs(seed=seed, rate_hz=RATE_HZ)
     wearer = SimulatedSubject(knobs, list(PLAN))
     end_s = sum(step.seconds for step in PLAN)
@@ -131,7 +132,7 @@ def person(seed: int) -> Person:
 
 @cache
 def calibrated(seed: int) -> Calibration | None:
-    """Return the calibration of the subject; None if the daemon would request another pose."""
+    """Return the calibration of the subject; None if a phase is refused."""
     rig, one = bench_rig(), person(seed)
     settings = replace(rig.calibration, functional_min_s=0.0)
     try:
@@ -170,7 +171,7 @@ def fresh(one: Person, calibration: Calibration, begin_s: float, end_s: float) -
 
 
 def taught(seed: int, calibration: Calibration) -> tuple[Calibration, int]:
-    """Return the calibration after all rounds, and the number of accepted rounds."""
+    """Return the calibration after all rounds of online learning, and how many were accepted."""
     taken = 0
     for k in range(ROUNDS):
         begin_s = LEARN_S + k * ROUND_S
@@ -239,7 +240,7 @@ def _compared(
 ) -> list[Result]:
     """Return median and worst error of the subjects at two times.
 
-    Neither may increase by more than `slack_deg` from the first to the second time.
+    The thresholds at the second time are the values at the first time plus `slack_deg`.
     """
     results = []
     for name, a, b in zip(
@@ -295,7 +296,7 @@ SPOILERS: dict[str, Callable[[OnlineFrames], OnlineFrames]] = {
 
 
 def guarded(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Count the accepted rounds with a wrong optical reference."""
+    """Count the refits that are accepted although the optical reference is wrong."""
     taken = dict.fromkeys(SPOILERS, 0)
     for seed in seeds:
         calibration = calibrated(seed)

@@ -64,7 +64,7 @@ def drawn_body(seed: int) -> tuple[Knobs, LegGeometry]:
 
 
 def other_bodies(_: Path) -> list[Result]:
-    """Measure the live errors of the default method and the mean, and of the segment lengths."""
+    """Measure errors of the methods anchored and mean, and of the calibrated segment lengths."""
     rig = bench_rig()
     found: dict[Method, list[Errors]] = {method: [] for method in METHODS}
     off_mm = []

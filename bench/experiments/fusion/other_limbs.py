@@ -1,9 +1,10 @@
-"""Calibration and live angles of simulated arms, trunks and pairs of legs, without wire formats.
+"""Calibration and live angles of simulated arms, trunks and pairs of legs.
 
-Each seed is another subject at the settings of the demo, with its own alignment, headings,
-artefact, markers and sensor errors. A subject is calibrated on a plate, a static pose and 60 s of
-movement. The angles are evaluated on the following 24 s. The truth is the angles of the bones, in
-the convention of each joint.
+The orientations do not pass through codecs and drivers. Each seed is another subject, with the
+default settings of the simulator. Subjects differ in sensor-to-segment alignment, headings,
+soft-tissue artefact, markers and sensor errors. A subject is calibrated with the sensors on a
+plate, in a static pose and in 60 s of movement. The angles are evaluated in 24 s of later movement.
+The truth is the angles of the bones, in the convention of each joint.
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ def spread(limb: str, _: Path) -> list[Result]:
 
 
 def _live(limb: str, rig: Rig, seed: int) -> _Live | None:
-    """Return the live part of one subject; None if its static pose is refused."""
+    """Return the fused states of one subject and its bones; None if its static pose is refused."""
     trials = phases(seed, limb=limb)
     alignment = fit_plate_alignment(trials.align, rig.calibration)
     pose = take_pose(trials.static, rig)
@@ -110,7 +111,7 @@ def _live(limb: str, rig: Rig, seed: int) -> _Live | None:
 
 
 def _errors(rig: Rig, live: _Live) -> dict[str, float]:
-    """Return RMS errors, deg, and coverage, by name of the joint and angle or of the segment."""
+    """Return RMS errors, deg, by name of the joint and angle or by name of the segment."""
     chain, found = rig.chain, dict[str, float]()
     for joint in inner_joints(chain):
         name, states = chain.joints[joint.number], [s.joints[joint.number] for s in live.states]

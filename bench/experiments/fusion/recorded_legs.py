@@ -1,10 +1,12 @@
 """Every fusion method on both legs of a recorded adult, by movement and with two references.
 
-A column is the median error of one segment or of flexion over eight assignments (deals) of filter
-errors. Each column has one leg, movement, training set and reference. The default method must be
-the best in every column, or within `MARGIN_DEG` of the best. Two experiments compare all methods in
-one movement each. Another experiment evaluates the errors about the long axes of the segments while
-the knee is nearly straight, where the reference is least certain.
+The virtual sensors contain recorded errors of orientation filters. A deal is one assignment of
+these errors to the sensors; there are eight. A column is the median error of thigh, shank or
+flexion over the deals, for one leg, movement, training set and reference. In every column, the
+error of the default method may exceed the error of the best other method by at most `MARGIN_DEG`.
+Two experiments compare all methods in one movement each. Another experiment evaluates the errors
+about the long axes of the segments while the knee is nearly straight, where the reference is least
+certain.
 """
 
 from __future__ import annotations
@@ -79,7 +81,10 @@ def held_out_squats(trials: Trials) -> list[tuple[list[KneeTrial], Trials]]:
 
 
 def untrained_sit_to_stand(trials: Trials) -> list[tuple[list[KneeTrial], Trials]]:
-    """Return 60 % of the squats, walking and jump for training, and sit-to-stand for evaluation."""
+    """Return training and evaluation data of an untrained movement, sit-to-stand.
+
+    The training data are 60 % of the squats, walking and the drop jump.
+    """
     ((taught, _),) = squats_alone(trials)
     return [([*taught, trials["walking1"], trials["DJ1"]], {"STS1": trials["STS1"]})]
 
@@ -126,11 +131,11 @@ def all_methods(
 
 
 def straight_knee(data: Path, deals: Sequence[int] = DEALS) -> list[Result]:
-    """Measure the share of the squared error about the long axis with a straight knee.
+    """Measure which share of the squared error is about the long axis while the knee is straight.
 
-    If thigh and shank are in line, both rotate about the same axis. The markers of pelvis and foot
-    determine this rotation of the reference poorly, and the knee of its model couples both
-    segments.
+    If thigh and shank are in line, both rotate about the same axis. Only the markers of pelvis and
+    foot determine this rotation of the reference, and they determine it poorly. The knee joint of
+    the reference model couples the rotations of both segments.
     """
     results = []
     for reference in REFERENCES:

@@ -1,8 +1,9 @@
 """Predicted uncertainty of the default method on both legs of a recorded adult, by movement.
 
-A case is one leg, one assignment (deal) of filter errors and one reference. Its coverage is the
-share of errors within 1 or 1.96 predicted standard deviations. It is computed for flexion, and for
-each segment about all axes, including the predicted standard deviation of the heading.
+A case is one leg, one reference, and one assignment (deal) of recorded filter errors to the
+sensors. The coverage of a case is the share of errors within 1 or 1.96 predicted standard
+deviations. It is computed for flexion, and for each segment about all three axes. The standard
+deviation of a segment includes the uncertainty of its heading.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
     Training = Callable[[Trials], list[tuple[list[KneeTrial], Trials]]]
 
 WITHIN = (1.96, 1.0)
-"""Numbers of predicted standard deviations. The thresholds are for the first."""
+"""Numbers of predicted standard deviations. The thresholds apply to the first number."""
 LEAST, MOST = 0.90, 0.99
 """Target range of the coverage."""
 INF = float("inf")
@@ -55,7 +56,7 @@ TRAININGS: dict[str, Training] = {
 
 
 def coverage(data: Path, deals: Sequence[int] = DEALS) -> list[Result]:
-    """Measure median and smallest coverage over legs and deals, by movement and of all."""
+    """Measure median and smallest coverage over legs and deals, by movement and for all cases."""
     results: list[Result] = []
     shares: list[Array] = []
     for label, training in TRAININGS.items():
@@ -132,7 +133,10 @@ def _shares(data: Path, case: LegCase, training: Training) -> dict[str, Array]:
 
 
 def segment_scores(model: SegmentModel, part: SegmentInputs) -> Array:
-    """Return the errors about each axis divided by the predicted ones, including heading."""
+    """Return the errors about each axis divided by their predicted standard deviations.
+
+    The standard deviations include the uncertainty of the heading.
+    """
     said = model.predict(part.sensors, part.other)
     off = rotation.log(rotation.multiply(rotation.conjugate(said), part.bone))
     w, x, y, z = said.T

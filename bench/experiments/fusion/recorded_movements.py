@@ -1,7 +1,8 @@
 """Every fusion method on the recorded movements of the knee.
 
-The data are from one leg of one subject, with virtual sensors made of skin markers and a model as
-reference. The results detect regressions; they do not validate the product.
+The data are from one leg of one subject. Virtual sensors are computed from skin markers; the
+reference is a musculoskeletal model. The results detect regressions of the program. They do not
+validate it.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ HOLD_OUT_GOALS = (1.2, 1.4, 1.0)
 HEADING_GOAL_DEG = 0.01
 DONNED_GOAL_DEG = 1.0
 POSE_SD_DEG = 1.0
-"""Standard deviation of a sensor's static pose between repetitions, deg per axis."""
+"""Standard deviation of a sensor's orientation between repetitions of the static pose, deg per
+axis."""
 DEFAULT = "anchored"
 FIT_GOAL_S = 0.5
 TOLERANCE = 0.05
@@ -83,7 +85,7 @@ def hold_out(data: Path) -> list[Result]:
 def left_out(data: Path) -> list[Result]:
     """Train on two movements, and evaluate on the third movement.
 
-    No result of the default method may be worse than the mean of two sensors or patent12.
+    No error of the default method may be larger than the smaller error of `mean` and `patent12`.
     """
     trials = _trials(data)
     judge = Judge.of(_halves(data)[0])
@@ -134,9 +136,10 @@ def turned_and_donned(data: Path) -> list[Result]:
 
 
 def coverage(data: Path) -> list[Result]:
-    """Measure the coverage in the training movement, in others, and in one of several.
+    """Measure the coverage of flexion errors in trained and untrained movements.
 
-    A few seconds of one movement contain few independent frames, so only the total has a threshold.
+    A few seconds of one movement contain few independent frames, so only the coverage of all cases
+    together has a threshold.
     """
     training, held = _halves(data)
     trials = _trials(data)
@@ -190,7 +193,10 @@ def flexion_scores(
 def joint_scores(
     models: Sequence[SegmentModel], alike: float, judged: KneeTrial
 ) -> NDArray[np.float64]:
-    """Return the normalized flexion errors of two models; `alike` is their error correlation."""
+    """Return the flexion errors divided by their predicted standard deviations, shape (n,).
+
+    `models` are the models of thigh and shank, and `alike` is the correlation of their errors.
+    """
     said, claimed = [], []
     for model, segment in zip(models, fusion_methods.segments(judged), strict=True):
         said.append(model.predict(segment.sensors, segment.other))
@@ -207,7 +213,8 @@ def joint_scores(
 def _donned(trial: KneeTrial, seed: int) -> KneeTrial:
     """Return the trial with sensors rotated by 10 to 20 degrees and a new static pose.
 
-    The new pose corrects the rotated alignment, except for the repeatability of the pose.
+    The new static pose corrects the rotation of the sensor. An error of `POSE_SD_DEG` remains,
+    because subjects do not repeat the pose exactly.
     """
     rng = np.random.default_rng(seed)
     sensors = []

@@ -1,9 +1,10 @@
 """Calibration and live estimation of simulated subjects, without wire formats.
 
 Each seed is another subject with its own alignment, headings, soft-tissue artefact and sensor
-errors, at the settings of the demo. The ground truth is the bones. The optical reference is skin
-markers. The calibration uses 60 s (joint circles, walking, squats, sit-to-stand), and the
-evaluation uses 24 s afterwards.
+errors, with the default settings of the simulator. The calibration receives skin markers as its
+reference; the evaluation compares its results with the simulated bones. The calibration uses 60 s
+(joint circles, walking, squats, sit-to-stand). The evaluation uses 24 s of later movement, the live
+part. "Without wire formats" means that the orientations do not pass through codecs and drivers.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ class Live:
 
 @dataclass(slots=True)
 class Errors:
-    """Squared errors and coverage of one method on one subject."""
+    """Errors of one method on one subject: RMS errors, deg, coverage, and errors of centers, mm."""
 
     knee: float = 0.0
     thigh: float = 0.0
@@ -159,7 +160,7 @@ def _rms_deg(angles: Array) -> float:
 
 @cache
 def people(method: Method, seeds: tuple[int, ...] = SEEDS) -> list[Errors]:
-    """Return the errors of a method on every accepted subject, in the order of `seeds`."""
+    """Return the errors of a method on the subjects with an accepted static pose, by seed."""
     rig = bench_rig()
     settings = replace(rig.calibration, method=method)
     found = []

@@ -1,9 +1,9 @@
 """Every fusion method on twenty simulated subjects with soft-tissue artefact.
 
-Each subject has its own alignment, headings, soft-tissue artefact and sensor errors, at the
-settings of the demo. The methods are trained on 60 s of four movements with skin markers as
-reference. They are evaluated on the following 24 s, when errors and headings have drifted. The
-ground truth is the bones.
+Each subject has its own alignment, headings, soft-tissue artefact and sensor errors, with the
+default settings of the simulator. The methods are trained on 60 s of four movements, with skin
+markers as reference. They are evaluated on 24 s of later movement, when sensor errors and headings
+have drifted. The ground truth is the orientation of the simulated bones.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ STRIDE = 4
 
 @cache
 def person(seed: int) -> tuple[KneeTrial, KneeTrial] | None:
-    """Return the training trial and the later trial of a subject; None without a static pose."""
+    """Return training trial and later trial of a subject; None if its static pose is refused."""
     rig, trials = bench_rig(), phases(seed)
     pose = take_pose(trials.static, rig)
     optical = trials.functional.optical
@@ -79,7 +79,7 @@ def _knee(columns: list[Array]) -> KneeTrial:
 
 
 def simulated(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Measure the errors of all methods, and predicted errors of patent12, mean and the default."""
+    """Measure the errors of all methods, and the coverage of four of them."""
     people = [found for seed in seeds if (found := person(seed)) is not None]
     figures = [Result("subjects accepted", len(people), len(seeds), len(seeds) - 2, unit="")]
     errors = {
@@ -114,7 +114,10 @@ def _coverage(people: list[tuple[KneeTrial, KneeTrial]]) -> list[Result]:
 
 
 def segment_scores(taught: KneeTrial, later: KneeTrial) -> Array:
-    """Return the errors about each axis divided by the predicted ones, including heading."""
+    """Return the errors about each axis divided by their predicted standard deviations.
+
+    The standard deviations include the uncertainty of the heading.
+    """
     scores = []
     for model, part in zip(
         fusion_methods.models([taught]), fusion_methods.segments(later), strict=True
@@ -129,7 +132,7 @@ def segment_scores(taught: KneeTrial, later: KneeTrial) -> Array:
 
 
 def _shares(label: str, scores: Sequence[Array], *, held: bool) -> list[Result]:
-    """Return the coverage of all subjects together, of the median and of the worst subject."""
+    """Return the coverage over all frames, and the median and smallest coverage of a subject."""
     tolerance = TOLERANCE if held else NOTHING
     results = []
     for share, within in ((0.68, 1.0), (0.95, 1.96)):

@@ -1,8 +1,8 @@
 """Movements of simulated subjects that are not part of the training.
 
-The subjects are those of `simulated_subjects`, with seeds that no other experiment uses. The models
-are trained on a quarter of the functional trial, which contains one movement, and are evaluated on
-three movements afterwards. The ground truth is the bones.
+The subjects are simulated as in `simulated_subjects`, with seeds that no other experiment uses. The
+models are trained on one movement, a quarter of the functional trial. They are evaluated on the
+other movements of the later trial. The ground truth is the orientation of the simulated bones.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ if TYPE_CHECKING:
 
 SEEDS = tuple(range(301, 313))
 TRAINED = ("walk", "squat")
-"""Movements of which each is the only training movement once."""
+"""Training movements. For each of them, models are trained on this movement alone."""
 WORDS = {"walk": "walking", "squat": "squats", "sit_to_stand": "sit-to-stand"}
 """Name of each movement in results."""
 LIVES = [name for name, _ in LIVE]
 """Movements of the later trial, in order of time; all have the same duration."""
 LEAST = 0.90
-"""Smallest share of errors within 1.96 stated standard deviations, median of subjects."""
+"""Threshold for the share of errors within 1.96 stated standard deviations, median of subjects."""
 
 
 def untrained(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
@@ -66,7 +66,7 @@ def _movement(trial: KneeTrial, movements: list[str], name: str) -> KneeTrial:
 
 
 def _results(title: str, cases: list[tuple[KneeTrial, KneeTrial]]) -> list[Result]:
-    """Return flexion errors of the default method and the mean, and the coverage."""
+    """Return flexion errors of the methods mean and anchored, and the coverage of anchored."""
     figures = []
     for method in ("mean", DEFAULT):
         errors = [

@@ -1,7 +1,8 @@
-"""Running estimates of the centers of a simulated leg whose knee center may move after calibration.
+"""Running estimates of joint centers of a simulated leg whose knee center moves after calibration.
 
-The movement of the calibration (walking, squats, guided movement) differs from the movement of the
-test (walking, sitting down and standing up). The soft-tissue artefact therefore differs, too.
+The test counts reports of a moved center, with and without a movement. The movement in the
+calibration (walking, squats, guided movement) differs from the movement in the test (walking,
+sitting down and standing up), so the soft-tissue artefact differs, too.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ MEMORY_S = 10.0
 MOVED_AT_S = 15.0
 CAMERAS_HZ = 40.0
 RIGID, WORN = 0.0, 5.0
-"""RMS soft-tissue artefact of the markers, mm: on the bones, and on the skin."""
+"""RMS soft-tissue artefact of markers, mm: 0 if they are fixed to the bones, 5 on the skin."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,10 @@ def wearer(seed: int, tissue_mm: float) -> Wearer:
 
 
 def followed(one: Wearer, moved_m: float) -> list[tuple[float, RunningCenter]]:
-    """Return times, s, and running centers; the knee moves by `moved_m` forward at `MOVED_AT_S`."""
+    """Return times, s, and running centers of a movement in which the knee center is displaced.
+
+    At `MOVED_AT_S`, the markers of shank and foot move forward by `moved_m` relative to the thigh.
+    """
     rig, track = bench_rig(), one.track
     below = [*rig.calibration.markers["shank"], *rig.calibration.markers["foot"]]
     columns = [track.markers.index(name) for name in below]
@@ -133,7 +137,7 @@ def followed(one: Wearer, moved_m: float) -> list[tuple[float, RunningCenter]]:
 
 
 def moving(tissue_mm: float, shifts_mm: tuple[float, ...], _: Path) -> list[Result]:
-    """Measure false reports without a shift, and the reports and the error of each shift."""
+    """Measure false reports without a displacement, and delay and error for each displacement."""
     shares, offsets = [], []
     for seed in WEARERS:
         still = [center for _, center in followed(wearer(seed, tissue_mm), 0.0)]

@@ -1,4 +1,7 @@
-"""Centers of rotation in the plane: equations, Cramér-Rao bound, other libraries, and time."""
+"""Centers of rotation in the plane: equations, Cramér-Rao bound, other libraries, and time.
+
+The numbers of equations are those of Akbarifar et al. 2021.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +47,10 @@ WIDE = CircleLimits(0.0, (0.0, np.inf), 0.0, np.inf)
 
 
 def three_frames(_: Path) -> list[Result]:
-    """Compare the closed form with Cramer's rule; measure the error of the misprinted equation."""
+    """Compare the closed form with the solution of the linear equations for the center.
+
+    The second result is the error of equation 11 as printed, with its misprint.
+    """
     rng = np.random.default_rng(1)
     p = rng.uniform(-1.0, 1.0, (30_000, 3, 2))
     u, v = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
@@ -62,7 +68,10 @@ def three_frames(_: Path) -> list[Result]:
 
 
 def _as_printed(rng: np.random.Generator) -> float:
-    """Return the RMS error, m, if (x1 - x2) replaces (x1 - x3): steps of 60°, noise of 1 mm."""
+    """Return the RMS error of equation 11 as printed, m: steps of 60°, noise of 1 mm.
+
+    In the denominator, the publication prints (x1 - x2) in place of (x1 - x3).
+    """
     p = arc_points(np.deg2rad(60.0) * np.arange(3), 0.2) + rng.normal(0, 0.001, (20_000, 3, 2))
     x, y, s = p[..., 0], p[..., 1], (p**2).sum(axis=-1)
     above = (s[:, 1] - s[:, 0]) * (y[:, 2] - y[:, 0]) - (s[:, 2] - s[:, 0]) * (y[:, 1] - y[:, 0])
@@ -71,7 +80,7 @@ def _as_printed(rng: np.random.Generator) -> float:
 
 
 def equal_steps(_: Path) -> list[Result]:
-    """Compare the predicted error (equation 15) with 200 000 simulated runs."""
+    """Compare the predicted error of equal steps (equation 15) with 200 000 simulated runs."""
     figures = []
     for step in (45, 60, 90, 120, 150):
         rng = np.random.default_rng(step)
@@ -167,7 +176,7 @@ def streaming(_: Path) -> list[Result]:
 
 
 def claims(_: Path) -> list[Result]:
-    """Measure the ratio of predicted to actual error, and the share of accepted short arcs."""
+    """Measure the ratio of predicted to actual error, and which share of short arcs is accepted."""
     figures = []
     for n, arc, noise in ((100, 22, 0.002), (100, 30, 0.002), *CASES[:3], CASES[4]):
         found = runs_on(n, arc, noise, runs=8000)

@@ -1,4 +1,7 @@
-"""Centers of rotation from points with measured angles, with and without angle errors."""
+"""Centers of rotation from the positions of a point and the measured rotation angle of its segment.
+
+The error of the center is compared with the error of a circle fit that ignores the angles.
+"""
 
 from __future__ import annotations
 
@@ -27,6 +30,7 @@ STATED: tuple[tuple[Kind, float], ...] = (
     ("slow", 1.0),
     ("OU", 1.5),
 )
+"""Angle noise that the estimator is designed for: its kind (see `angle_error`) and RMS, deg."""
 BEYOND: tuple[tuple[Kind, float], ...] = (
     ("white", 3.0),
     ("slow", 3.0),
@@ -35,11 +39,16 @@ BEYOND: tuple[tuple[Kind, float], ...] = (
     ("gain", 1.0),
     ("gain", 3.0),
 )
+"""Angle noise beyond the design: larger, or proportional to the angle."""
 ARCS = (20, 30, 45, 60, 75, 90, 180)
 
 
 def angle_error(kind: Kind, size: float, rng: np.random.Generator) -> Array:
-    """Return angle errors of RMS `size`, shape (FRAMES,)."""
+    """Return angle errors of RMS `size`, shape (FRAMES,).
+
+    The kinds are white noise, a slow sine, an error of the scale ("gain"), and an
+    Ornstein-Uhlenbeck process with a time constant of 1 s ("OU").
+    """
     n = FRAMES
     if kind == "white":
         return np.asarray(size * rng.normal(size=n))
@@ -81,7 +90,7 @@ def rms_errors(arc: float, kind: Kind, degrees: float, runs: int) -> tuple[float
 
 
 def table(_: Path) -> list[Result]:
-    """Measure the ratio of the RMS error with angles to the RMS error of the plain Hyper fit."""
+    """Measure the ratio of the RMS error with angles to the RMS error of Hyper without angles."""
     figures = []
     for arc in ARCS:
         for kind, degrees in (*STATED, *BEYOND):

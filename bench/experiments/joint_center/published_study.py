@@ -1,8 +1,8 @@
-"""Replication of the published numerical experiment, and tests of two claims of the publication.
+"""Replication of the numerical experiment of Akbarifar et al. 2021, and tests of two of its claims.
 
-Table 1 is compared with its legible digits. The first claim is that repetitions of a small rotation
-yield an accurate mean. The second claim is that the distance of the marker from the center has
-little influence.
+The computed table 1 is compared with the legible digits of the printed table. The first claim is
+that repetitions of a small rotation yield an accurate mean center. The second claim is that the
+distance of the marker from the center has little influence on the error.
 """
 
 from __future__ import annotations
@@ -30,9 +30,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 EXPECTED = {"α–σ": (0.98, 0.81), "r–σ": (1.00, 0.99), "r–α": (0.96, 0.91)}
-"""Two correlations from an independent implementation, by pair of the quantities noise σ, radius r
-and rotation angle α: of predicted and analytic errors, and of analytic errors and grid search. The
-errors are clipped at the limit that reproduces the publication best (`NEAREST`)."""
+"""Correlations between error maps, from an independent implementation. A map shows the error by two
+of the quantities noise σ, radius r and rotation angle α. The first number is the correlation of
+predicted and analytic errors. The second number is the correlation of analytic errors and errors
+found by a grid search. The errors are clipped at the limit with which the correlations are closest
+to the publication (`NEAREST`)."""
 LARGE_RADIUS_M = 0.07
 """Radius of the marker, m, above which the radius has little influence on the error (noise 5
 mm)."""

@@ -1,6 +1,6 @@
 """Hip and knee centers of recorded subjects, compared with the centers of their models.
 
-The thresholds are much larger than the measured values, so they detect regressions only. Along the
+The thresholds are much larger than the measured values, so they detect only gross errors. Along the
 axis of a hinge, the center is undetermined. The skin of the thigh slides over the femur in every
 step. Results that depend on one of these two effects have no threshold.
 """

@@ -63,7 +63,7 @@ def rms(errors: list[Array]) -> float:
 
 
 def four_markers(_: Path) -> list[Result]:
-    """Measure the errors with four markers, an arc of 20° and a noise of 2 mm, in 400 runs."""
+    """Measure the error of the center: four markers, arc of 20°, noise of 2 mm, 400 runs."""
     rng = np.random.default_rng(7)
     truth, noise = fan(20.0), 2e-3
     bound = np.sqrt(sphere_bound(truth, noise))
@@ -189,18 +189,19 @@ def parent_covariance(_: Path) -> list[Result]:
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """One movement with one type of noise."""
+    """One movement of the markers and one type of noise."""
 
     name: str
     paths: Paths
-    """True paths of the markers, m, shape (n, k, d)."""
+    """Function that returns the true paths of k markers in n frames, m, shape (n, k, d)."""
     see: Callable[[np.random.Generator, Array], Array]
+    """Function that returns the measured paths, from the true paths."""
     efficient: float = inf
     """Threshold for the ratio of RMS error to the bound."""
 
 
 def measured(setup: Setup, runs: int, seed: int = 2024) -> list[Result]:
-    """Return coverage, and ratio of RMS error to the bound, of the streaming estimator."""
+    """Return the coverage of the streaming estimator, and its RMS error divided by the bound."""
     rng = np.random.default_rng(seed)
     errors, bounds, held, refused = [], [], 0, 0
     for _run in range(runs):

@@ -1,9 +1,9 @@
-"""Effect of marker refinement in the daemon, measured against the bones.
+"""Effect of the daemon's marker refinement on the errors of simulated subjects.
 
-Simulated subjects are calibrated with and without `refine_markers`. For some subjects, one marker
-of each segment is displaced between static pose and movement. Live errors are compared for each
-subject. They refer to the simulated bones, so the cameras affect them only through the
-calibrations.
+The subjects are calibrated with and without `refine_markers`. For some subjects, one marker of each
+segment is displaced between the static pose and the movement. For each subject, the live errors of
+the two calibrations are compared. The errors are differences from the simulated bones, so the
+cameras affect them only through the calibrations.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ COSTS_NOTHING_DEG = 0.1
 
 
 def refined(_: Path) -> list[Result]:
-    """Measure the change of live errors by refinement, deg; a negative change is an improvement."""
+    """Measure how refinement changes the live errors, deg; a negative change is an improvement."""
     rig = bench_rig()
     worn: list[Array] = []
     knocked: list[Array] = []

@@ -49,7 +49,7 @@ def slope(data: Path) -> list[Result]:
 
 
 def fit(data: Path) -> list[Result]:
-    """Measure the tracking error of all frames without refinement."""
+    """Measure the tracking error (RMS distance of measured and model markers) before refinement."""
     model = oc4_lower(data)
     figures = []
     for trial, expected in EXPECTED_MM.items():
@@ -118,7 +118,7 @@ def live_us(model: ChainModel, y: Array) -> tuple[float, float]:
 
 
 def speed(data: Path) -> list[Result]:
-    """Measure the time with seven segments (29 markers, 20 coordinates) and with two segments."""
+    """Measure the time per frame: seven segments (29 markers, 20 coordinates), and two segments."""
     model = oc4_lower(data)
     y = measured(data, "walking1", model)
     small = two_segments()

@@ -1,6 +1,7 @@
-"""Refined markers, evaluated by the inverse kinematics of OpenSim.
+"""Refined marker positions of a model, evaluated by the inverse kinematics of OpenSim.
 
-Only the marker positions of the models are changed.
+The refinement changes only the marker positions of the models. A reduction is the decrease of the
+RMS marker error in percent.
 """
 
 from __future__ import annotations
@@ -129,7 +130,7 @@ def walking_alone(data: Path) -> list[Result]:
 
 
 def _to_the_end(subject: OpensimSubject, found: Refinement) -> list[Result]:
-    """Return OpenSim's errors in walking, with an accuracy that does not stop its tool early."""
+    """Return OpenSim's errors in walking, with a tolerance at which its solver converges."""
     walk = subject.judged["walking1"]
     before = judge(subject.model, walk, accuracy=CONVERGED).rms
     after = judge(subject.model, walk, found.model, CONVERGED).rms
@@ -150,7 +151,7 @@ def _to_the_end(subject: OpensimSubject, found: Refinement) -> list[Result]:
 
 
 def three_movements(data: Path) -> list[Result]:
-    """Refine one marker set on three movements, which also determine the trial weights."""
+    """Refine one marker set on three movements; select the evenness by cross-validation on them."""
     subject = opencap(data)
     evenness = chosen_evenness(subject, THREE)
     figures = [Result("evenness chosen by cross-validation", evenness, inf, unit="")]
@@ -184,17 +185,20 @@ def _across(verdicts: Mapping[str, Verdict]) -> float:
 def refined_evenly(
     subject: OpensimSubject, trained: Sequence[str], power: float, judged: Sequence[str] = ()
 ) -> Refinement:
-    """Return markers learned from some trials; trials with larger errors have larger weights."""
+    """Return markers refined on the trials `trained`, and their errors in the trials `judged`.
+
+    The weight of a trial is its error raised to `power`, the evenness.
+    """
     settings = RefinementSettings(huber_m=None, frames=100, evenness=power)
     trials, others = ([subject.motion(n) for n in names] for names in (trained, judged))
     return refine_markers(subject.chain(), trials, settings, others)
 
 
 def chosen_evenness(subject: OpensimSubject, trained: Sequence[str]) -> float:
-    """Return the largest weighting exponent whose held-out error is within 2 % of the smallest.
+    """Return the largest evenness whose held-out error is within 2 % of the smallest.
 
     The held-out error is the mean over the training trials, each of which is held out in turn. A
-    larger exponent distributes the remaining errors more evenly.
+    larger evenness makes the errors of the trials more equal.
     """
     means = {}
     for power in _EVENNESS:

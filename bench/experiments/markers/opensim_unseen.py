@@ -1,7 +1,7 @@
 """Markers refined on all movements but one, and evaluated by OpenSim on the remaining movement.
 
-No setting is chosen on the evaluated movements. Prior, weights and loss are the defaults of the
-other experiments with OpenSim.
+No setting is chosen on the evaluated movements. The prior, the weights and the loss of the
+refinement are those of the other experiments with OpenSim.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 _MM, _MM2 = 1000.0, 1e6
 _SETTINGS = RefinementSettings(huber_m=None, frames=40)
 _STUCK_M = 0.001
-"""Difference between OpenSim's error in a frame and the error of the restarted solution, m, that
-indicates a local minimum."""
+"""If OpenSim's RMS error in a frame exceeds the error of the restarted solution by more than this
+value, m, OpenSim's solution is counted as a local minimum."""
 
 
 def every_movement(data: Path) -> list[Result]:
@@ -82,7 +82,10 @@ def _less(before: float, after: float) -> float:
 
 
 def _squared(subject: OpensimSubject, name: str, model: ChainModel) -> Array:
-    """Return the squared errors of the restarted solution, m², shape (frames, markers)."""
+    """Return the squared marker errors of the restarted solution, m², shape (frames, markers).
+
+    This project's inverse kinematics is restarted from other poses to leave local minima.
+    """
     targets = to_z_up(subject.judged[name].positions)
     weights = np.isfinite(targets).all(axis=-1).astype(float)
     options = IkOptions(limit_m2=_SETTINGS.limit_m2)
@@ -98,9 +101,9 @@ def _stuck(subject: OpensimSubject, name: str, model: ChainModel, judged: Array)
 
 
 def _share_of_torso_and_arms(data: Path) -> dict[str, float]:
-    """Return the error share of the 13 markers of torso and arms, by movement.
+    """Return the share of the 13 markers of torso and arms in the squared error, by movement.
 
-    The model has 43 markers, and no marker is refined.
+    The model of the whole body has 43 markers. Their positions are not refined.
     """
     whole, legs = opencap(data), set(opencap_legs(data).names)
     upper = [i for i, name in enumerate(whole.names) if name not in legs]

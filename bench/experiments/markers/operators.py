@@ -1,4 +1,8 @@
-"""Repeatability between six operators, who place the markers of one subject with errors."""
+"""Differences of joint angles if six operators place the markers of one subject with errors.
+
+The errors of placement and the noise are simulated. The differences are measured before and after
+marker refinement.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +42,7 @@ _UNSEEN = "DJ1"
 
 
 def _movements(data: Path) -> dict[str, ChainState]:
-    """Return the true poses of the subject."""
+    """Return the poses of the subject, by movement, from which the markers are simulated."""
     model = oc4_lower(data)
     return {
         name: solve_frames(model, motion(data, name, step).targets).state
@@ -59,7 +63,7 @@ def spread_deg(errors: list[Array]) -> float:
 def team(
     model: ChainModel, truly: dict[str, ChainState], seed: int, settings: RefinementSettings
 ) -> dict[str, tuple[float, float]]:
-    """Return the results of six operators before and after the refinement."""
+    """Return the results of one group of six operators: values before and after refinement."""
     rng = np.random.default_rng([61, seed])
     errors: dict[str, tuple[list[Array], list[Array]]] = {name: ([], []) for name in truly}
     tracking, places = [], []
@@ -95,7 +99,7 @@ def team(
 
 
 def repeatability(data: Path, teams: int = TEAMS) -> list[Result]:
-    """Measure the median over teams before and after refinement, and the worst relative change."""
+    """Measure the median over the groups before and after refinement, and the worst change, %."""
     model, truly = oc4_lower(data), _movements(data)
     settings = RefinementSettings()
     found = [team(model, truly, seed, settings) for seed in range(teams)]

@@ -1,9 +1,9 @@
 """Marker refinement on the movements of a recorded adult and on simulated movements.
 
 The thresholds are the results of a reference implementation of the same equations, plus a margin.
-The published results of the coordinate search (tracking error −38.4 %, variance of the tracking
-error −53.7 %) refer to its training trials. The experiment on simulated subjects reports the same
-quantities.
+The tracking error is the RMS distance between measured and model markers. The published coordinate
+search reduced it by 38.4 %, and its variance by 53.7 %, in the trials on which it was trained. The
+experiment on simulated subjects reports the same quantities.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chains import ChainModel, ChainState
 
 _EVERY = {"walking1": 1, "squats1": 8, "DJ1": 2, "STS1": 8}
-"""Step between evaluated frames, by movement. For learning, every tenth frame of the squats is
-used."""
+"""Step between used frames, by movement. `unseen` uses every tenth frame of the squats for the
+refinement."""
 _RECORDED = (FOLDER,)
 _ALL = 10_000
 _PELVIS = 4
@@ -69,7 +69,7 @@ def walked(data: Path) -> tuple[Refinement, float]:
 
 
 def fast(data: Path) -> list[Result]:
-    """Refine markers and poses simultaneously on walking."""
+    """Measure error, steps and time of the simultaneous refinement of markers and poses."""
     found, seconds = walked(data)
     return [
         Result("walking1", rms_mm(found, "walking1"), 4.85, unit="mm"),
@@ -172,7 +172,7 @@ def unseen(data: Path) -> list[Result]:
 
 
 def invisible(data: Path) -> list[Result]:
-    """Count the directions that the tracking error does not determine."""
+    """Count the directions of the marker positions that the tracking error does not determine."""
     gauge = walked(data)[0].gauge
     return [
         Result("free directions", gauge.free, 7, 7, unit=""),
@@ -181,7 +181,11 @@ def invisible(data: Path) -> list[Result]:
 
 
 def _tissue(rng: np.random.Generator, clean: Array, rate: int) -> Array:
-    """Return markers that slide back and forth by 6 mm, with 1 mm of noise."""
+    """Return markers with a simulated soft-tissue artefact and noise, m.
+
+    The artefact is a sine with an amplitude of 6 mm per axis (standard deviation). The noise is
+    1 mm. A larger `rate` increases the frequency of the sine.
+    """
     frames, markers = clean.shape[:2]
     turns = (1 + 0.3 * rate) * np.arange(frames)[:, None, None] / frames
     phase = rng.uniform(0.0, 2 * np.pi, (markers, 1))
@@ -190,7 +194,7 @@ def _tissue(rng: np.random.Generator, clean: Array, rate: int) -> Array:
 
 
 def people(data: Path, count: int = 8) -> list[Result]:
-    """Refine the markers of simulated subjects at three speeds; the first speed is for training."""
+    """Refine the markers of simulated subjects on the first of three speeds; evaluate on all."""
     model = oc4_lower(data)
     held = {m.name: (True, True, True) for m in model.markers[:_PELVIS]}
     walk = solve_frames(model, measured(data, "walking1", model)).state
@@ -224,7 +228,10 @@ def people(data: Path, count: int = 8) -> list[Result]:
 
 @dataclass(frozen=True, slots=True)
 class _Draw:
-    """Simulated movements with 3 mm of noise; free markers are displaced by 10 mm per axis."""
+    """Simulated movements with 3 mm of noise, and a model with displaced markers.
+
+    Free markers of the model are displaced by 10 mm per axis (standard deviation).
+    """
 
     start: ChainModel
     clean: dict[str, Array]
@@ -260,7 +267,10 @@ def _moved(data: Path) -> dict[str, ChainState]:
 
 
 def truth(data: Path, count: int = 8) -> list[Result]:
-    """Measure errors with noise of 3 mm and displacements of 10 mm; locked markers are exact."""
+    """Measure errors of marker positions and joint angles if the anatomical markers are locked.
+
+    The noise is 3 mm. Locked markers are exact; free markers are displaced by 10 mm per axis.
+    """
     model, truly = oc4_lower(data), _moved(data)
     off_mm, shares, errors = [], [], []
     for draw in _draws(model, truly, _ANATOMICAL, count):
@@ -283,8 +293,8 @@ def truth(data: Path, count: int = 8) -> list[Result]:
 def feet_let_go(data: Path, count: int = 32) -> list[Result]:
     """Measure errors if heels and toes are also free, so that the foot's rotation is undetermined.
 
-    The results include an ideal case. In this case, the markers are learned from noise-free
-    movements, with a prior that only selects among equally good markers.
+    The results include an ideal case: the markers are refined on movements without noise, with a
+    prior so weak that it only selects among marker positions with equal errors.
     """
     model, truly = oc4_lower(data), _moved(data)
     shares = []

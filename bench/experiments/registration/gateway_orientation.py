@@ -1,7 +1,7 @@
-"""Orientation that the gateway computes from raw readings, through the driver.
+"""Orientations that the gateway's driver computes from raw readings of a sensor.
 
-The orientation is compared with optical data and with the filter package alone. Another result is
-the error if the filter starts while the sensor moves.
+The orientations are compared with optical data, and with the output of the filter package without
+the driver. Another result is the error if the filter starts while the sensor moves.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ FAST = raw_imu_trials.TRIALS[1]
 STARTS = 20
 SECOND = round(1e9 / raw_imu_trials.PERIOD_NS)
 SETTLED_GOAL_DEG = 4.0
-"""Largest RMS error of the first second with output, deg. Later, the RMS error is 2.8 deg."""
+"""Threshold for the RMS error of the first second with output, deg. Later, the RMS error is
+2.8 deg."""
 ROUNDING_DEG = 1e-6
 """Largest difference due to rounding, deg."""
 
@@ -69,7 +70,7 @@ def _from_package(trial: raw_imu_trials.BoardTrial, said: Array | None, kind: st
 
 
 def begun_in_motion(data: Path) -> list[Result]:
-    """Measure the RMS error by second after a filter start, for twenty starts in fast motion."""
+    """Measure the RMS error in each second after a filter start; twenty starts in fast motion."""
     trial = raw_imu_trials.load(data, FAST)
     rng = np.random.default_rng(0)
     last = len(trial.moving) - 8 * SECOND

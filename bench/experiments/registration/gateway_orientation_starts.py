@@ -27,11 +27,11 @@ FIRST_MAX_DEG, LATER_MAX_DEG, GAP_MAX_DEG = 6.0, 4.0, 4.0
 
 
 def ten_starts(data: Path) -> list[Result]:
-    """Measure the largest RMS error of three one-second periods, among ten starts per trial.
+    """Measure the largest RMS error among ten starts per trial, in three periods of one second.
 
     The periods are the first second with output, the second around 10 s after the start, and the
-    first second with output after a gap of 2 s. The settling time is the time from start or gap to
-    output.
+    first second with output after a gap of 2 s. The settling time is the time from the start, or
+    from the end of the gap, to the first output.
     """
     figures = []
     for path in sorted((data / "broad").glob("*.hdf5")):

@@ -43,7 +43,7 @@ RATE_HZ = 100
 STEP_NS = 10_000_000
 GRAVITY, FIELD = 9.81, 48.0
 NOISE = (0.003, 0.03, 0.3)
-"""Standard deviations of rate, rad/s, force, m/s², and field, uT."""
+"""Standard deviations of the noise of angular rate, rad/s, specific force, m/s², and field, uT."""
 SIMULATED_SENSORS = Material(
     "12 simulated sensors with bias (0.6 deg/s and 0.3 m/s²), scale errors (2 %), hard-"
     "iron errors (25 uT) and soft-iron errors (8 % of 48 uT), all as standard deviations, "
@@ -55,7 +55,7 @@ POSES = DIRECTIONS[[0, 1, 2, 3, 4, 5, 6, 7, 10, 11, 14, 15]]
 
 @dataclass(frozen=True)
 class SimulatedSensor:
-    """Biases and error matrices of a sensor.
+    """Biases and error matrices of a sensor: reading = matrix · true value + bias.
 
     The matrices of accelerometer and magnetometer are symmetric.
     """
@@ -131,7 +131,7 @@ def _posed(sensor: SimulatedSensor, rng: np.random.Generator) -> list[SensorRead
 
 
 def _turned(sensor: SimulatedSensor, rng: np.random.Generator) -> list[SensorReading]:
-    """Return readings of a rotation in all directions."""
+    """Return readings for the magnetometer step: 600 random directions of the field."""
     north = _unit(rng.normal(size=(600, 3)))
     return sensor.measure(north, north, np.zeros(north.shape), rng)
 
@@ -156,7 +156,7 @@ def turned_sensor(
 def orientation_error(
     q: Array, readings: list[SensorReading], calibration: SensorCalibrationSettings | None
 ) -> tuple[float, float]:
-    """Return the RMS errors of the orientation and of the inclination after 10 s, deg."""
+    """Return the RMS errors of orientation and inclination, deg, without the first 10 s."""
     correction = None if calibration is None else SensorCorrection(calibration)
     samples = RawSamples(RATE_HZ, magnetometer=True, correction=correction)
     found = [
@@ -176,7 +176,7 @@ def orientation_error(
 
 
 def before_and_after(_: Path) -> list[Result]:
-    """Measure median and largest RMS error of the sensors, and scale errors of the gyroscopes."""
+    """Measure orientation errors and gyroscope scale errors: median and largest of the sensors."""
     errors, scales = [], []
     for seed in range(SENSORS):
         rng = np.random.default_rng(seed)

@@ -1,4 +1,8 @@
-"""Detection of rest, the static mean, and the alignment of sensor world and optical world."""
+"""Detection of rest, the mean orientation of a static pose, and the alignment on a plate.
+
+The alignment estimates two rotations: q_W from the sensor's world to the optical world, and q_B
+from the sensor to the body.
+"""
 
 from __future__ import annotations
 
@@ -53,9 +57,9 @@ def stillness(data: Path) -> list[Result]:
 
 
 def static_mean(_: Path) -> list[Result]:
-    """Measure the error of the static mean, with a scatter of 1 degree per axis and outliers.
+    """Measure the error of the mean of 500 orientations with noise of 1 degree per axis.
 
-    A fifth of the frames are outliers, which differ by 30 to 90 degrees.
+    A fifth of the orientations are outliers, which differ from the truth by 30 to 90 degrees.
     """
     rng = np.random.default_rng(2)
     errors = []
@@ -94,7 +98,7 @@ def random_walk(
 
 
 def plate(_: Path) -> list[Result]:
-    """Measure world and alignment errors on a plate, with and without 15 % random orientations."""
+    """Measure the errors of q_W and q_B on a plate, without outliers and with 15 % outliers."""
     figures = []
     for share, label in ((0.0, "clean"), (0.15, "15 % outliers")):
         world, mount = [], []
@@ -133,7 +137,7 @@ def _aligned(q_s: Array, q_opt: Array, kept: slice) -> list[Result]:
 
 
 def real_plate(data: Path) -> list[Result]:
-    """Align a recorded board whose orientation is from a filter; 30 s of motion at 47.6 Hz."""
+    """Align a recorded board; a filter computes its IMU orientation; 30 s of motion at 47.6 Hz."""
     h5py, vqf = import_module("h5py"), import_module("vqf")  # imported by this experiment only
     with h5py.File(data / "broad" / f"{TRIALS[0]}.hdf5") as trial:
         rate = float(trial.attrs["sampling_rate"])
@@ -145,7 +149,10 @@ def real_plate(data: Path) -> list[Result]:
 
 
 def integrated_plate(data: Path) -> list[Result]:
-    """Align a recorded board whose orientation is the integrated rate; 30 s of motion after 5 s."""
+    """Align a recorded board, whose IMU orientation is the integral of the angular rate.
+
+    The data are 30 s, which begin 5 s after the start of the motion.
+    """
     with np.load(data / "broad_excerpts" / f"{TRIALS[0]}_60s.npz", allow_pickle=False) as trial:
         rate = float(trial["sampling_rate"])
         gyr = trial["imu_gyr"].astype(np.float64)

@@ -1,9 +1,9 @@
 """Sensors that are lost, stick, slip or drift, on simulated subjects.
 
-The subjects have the settings of the demo: 5 degrees of soft-tissue artefact that is common to the
-sensors of a segment, 3 degrees of artefact of each sensor, filter errors of the sensors, and random
-alignments and headings. A jump is the difference between the output with the fault and the output
-of the same subject without the fault, divided by the predicted RMS error of the same frame.
+The subjects have the default settings of the simulator: 5 degrees of soft-tissue artefact that is
+common to the sensors of a segment, 3 degrees of artefact that differs between the sensors, errors
+of the orientation filters, and random alignments and headings. A jump is the angle between the
+output with the fault and the output without it, divided by the predicted RMS error of the frame.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ SEEDS = (1, 2, 5, 6, 7, 8)
 RATE_HZ = 50.0
 FAULT_S = 60.0
 FIRST_S, APART_S = 17.3, 6.1
-"""First start time of a fault, and time between faults, s. The faults occur in all movements."""
+"""Start time of the fault of the first sensor, and its increase from sensor to sensor, s. Faults
+therefore occur in all movements."""
 SLIPS_DEG = (10.0, 15.0, 30.0)
 RATES = (0.0, 1.0, 3.0, 10.0)
 DRIFT_S, DRIFT_HZ = 300.0, 25.0
@@ -53,7 +54,7 @@ HOURS_EACH = 0.5
 HEALTHY = SEEDS[:4]
 """Seeds of the subjects whose sensors have no fault."""
 KNEE_GOAL_DEG = 5.0
-"""Largest error of the knee rotation after a compensated heading drift, deg."""
+"""Threshold for the error of the knee rotation with compensated heading drift, deg."""
 KNEE = Chain(("hip", "knee", "ankle"), SEGMENTS, (("S1", "S2"), ("S3", "S4")))
 SEMIREAL_HZ = 100.0
 SOON_S = 3.0
@@ -80,7 +81,7 @@ def _cases(
         [faulty_wearer.SubjectRecording, str, float, int], faulty_wearer.SubjectRecording
     ],
 ) -> Iterator[tuple[float, str, list[tuple[float, SensorReport]], Array]]:
-    """Yield for every subject and sensor: start of the fault, sensor, events, and jumps."""
+    """Yield start of the fault, sensor, events and jumps, for a fault of each sensor in turn."""
     for seed, calibration in calibrated_people(seeds):
         person = faulty_wearer.live(seed, FAULT_S, RATE_HZ)
         before, _ = faulty_wearer.play(fuser_of(calibration), person)
@@ -142,7 +143,7 @@ def slip(_: Path, degrees: float, seeds: tuple[int, ...] = SEEDS) -> list[Result
     )  # fmt: skip
     if degrees > SLIPS_DEG[0]:
         return figures
-    # The smallest slip is about as large as the soft-tissue artefact, so not all are reported.
+    # The smallest slip is about as large as the soft-tissue artefact, so some are not reported.
     share = figures[0]
     return [Result(share.name, share.value, 100.0, 80.0, unit="%"), *figures[1:]]
 
@@ -173,13 +174,13 @@ def false_alarms(
 def real_skin(data: Path, trained: str, deals: Sequence[int] = DEALS) -> list[Result]:
     """Measure the share of recorded movements with a fault event although no sensor has a fault.
 
-    The model is trained on one of the movements.
+    The calibration uses the movement `trained`; the evaluation uses the other movements.
     """
     mounts = {name: rotation.IDENTITY for group in KNEE.sensors for name in group}
     alarms, seconds = [], 0.0
     for case in (LegCase(leg, deal, name) for name in REFERENCES for leg in LEGS for deal in deals):
         training = _offline(recorded_leg(data, trained, case), trained)
-        # The sensor links, from which faults are detected, are the same for all methods.
+        # The data from which faults are detected (sensor links) do not depend on the method.
         calibration = fit_offline(KNEE, [training], mounts, "mean")
 
         for movement in MOVEMENTS:
@@ -205,7 +206,10 @@ def _offline(knee: KneeTrial, name: str) -> OfflineTrial:
 
 
 def drift(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Measure the knee rotation error in the fifth minute of drift, corrected and uncorrected."""
+    """Measure the knee rotation error in the fifth minute of heading drift.
+
+    The errors with and without drift compensation are results.
+    """
     figures = []
     for rate in RATES:
         for names, who in ((("S3", "S4"), "shank"), (("S4",), "one sensor")):
@@ -221,7 +225,7 @@ def drift(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
 def _drifted(
     seeds: tuple[int, ...], names: tuple[str, ...], rate: float
 ) -> tuple[list[float], list[float]]:
-    """Return the RMS errors of the subjects without and with correction, deg."""
+    """Return the RMS errors of the subjects without and with drift compensation, deg."""
     errors: dict[bool, list[float]] = {False: [], True: []}
     for seed, calibration in calibrated_people(seeds):
         person = faulty_wearer.live(seed, DRIFT_S, DRIFT_HZ)

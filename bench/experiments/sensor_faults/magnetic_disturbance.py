@@ -1,8 +1,9 @@
 """Magnetic disturbance: the headings of one or both sensors deviate for half a minute.
 
-A filter with a magnetometer follows the field within seconds. Its heading deviates by 20 to 40
-degrees in one direction, for one sensor or both sensors of a segment, in all movements. The fused
-result is compared with the bones, and with the result of the same subject without disturbance.
+An orientation filter with a magnetometer follows a changed field within seconds. The simulated
+headings deviate by 20 to 40 degrees in one direction, for one sensor or for both sensors of a
+segment. Disturbances occur in all movements. The fused orientations are compared with the bones,
+and with the fused orientations of the same subject without disturbance.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ LEAST_DEG, MOST_DEG = 20.0, 40.0
 PASSED_DEG = 10.0
 """Deviation of the heading at which the delay of a report begins, deg."""
 OVER_S = 8.0
-"""Time from the end of the disturbance to the evaluation of errors, s."""
+"""Time from the end of the disturbance to the first frame that is evaluated as undisturbed, s."""
 ALONE = (("S1",), ("S2",), ("S3",), ("S4",))
 BOTH = (("S1", "S2"), ("S3", "S4"))
 FLEXION_GOAL = 1.96

@@ -1,4 +1,4 @@
-"""Batch of recordings: time with one and two processes, memory, growth with the recordings."""
+"""`jointfit batch`: time with one and two processes, memory, growth with the recordings."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ libraries are loaded."""
 
 
 def batch_results(quick: bool) -> list[Result]:
-    """Measure batches with one and two processes in turn, then run a long batch."""
+    """Measure batches with one and two processes in turn, then the memory of a long batch."""
     count, rounds, many, warm = (4, 1, 40, 10) if quick else (COUNT, ROUNDS, MANY, WARM)
     with tempfile.TemporaryDirectory(prefix="jointfit-bench-") as temporary:
         folder = Path(temporary)

@@ -1,7 +1,7 @@
-"""Chain model in the daemon: mean cost of a camera frame, and largest cost with faulty markers.
+"""Inverse kinematics of a chain model in the daemon: CPU time of a camera frame.
 
-The cost of a frame is its smallest cost over the repeats, so other processes do not affect it. The
-cost of the slowest frame is the largest of these costs.
+The results are the mean time of a frame, and the time of the slowest frame with faulty markers. The
+time of a frame is the minimum over the repeats, so other processes hardly affect it.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def _sample() -> tuple[LoadedModel, LoadedModel, tuple[str, ...], Array]:
 
 @cache
 def _both_legs() -> tuple[LoadedModel, tuple[str, ...], Array]:
-    """Return a model with two equal legs on one pelvis, and its markers in the same movement."""
+    """Return a model with two equal legs on one pelvis, and its markers if both move alike."""
     loaded, _, names, points = _sample()
     leg = loaded.chain
     order = [names.index(name) for name in leg.marker_names]
@@ -122,7 +122,7 @@ def _track(model: LoadedModel, frames: list[MocapFrame]) -> Callable[[], object]
 
 
 def _worst_us(model: LoadedModel, frames: list[MocapFrame], repeats: int) -> float:
-    """Return the CPU time of the slowest frame, µs; each frame has the minimum of its repeats."""
+    """Return the CPU time of the slowest frame, µs; each frame is the minimum of its repeats."""
     least = np.full(len(frames), np.inf)
     for _ in range(repeats):
         tracker = ChainTracker(model, RATE_HZ)

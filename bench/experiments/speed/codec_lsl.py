@@ -1,7 +1,8 @@
 """LSL markers: CPU time of codec and decoder per sample, compared with pylsl on the same stream.
 
-pylsl receives the samples of a simulated program over the network of this host. The CPU time of the
-thread that takes the samples counts, the CPU time of the receiving threads of liblsl does not.
+pylsl receives the samples of a simulated program over the network of this host. The result contains
+the CPU time of the thread that takes the samples from pylsl, but not the CPU time of the threads in
+which liblsl receives them.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """MIP: CPU time of codec and decoder per packet, compared with the vendor's library `pymscl`.
 
 The library reads a serial port in its own threads. Therefore, codec and library alternately read
-the same packets from a pseudo-terminal (pty), and convert all fields to numbers. The processor time
-of the whole process counts.
+the same packets from a pseudo-terminal (pty), and convert all fields to numbers. The result is the
+processor time of the whole process.
 """
 
 from __future__ import annotations

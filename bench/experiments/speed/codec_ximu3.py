@@ -81,8 +81,9 @@ def _ours_s(file: Path) -> float:
 def _theirs_s(file: Path, *, live: bool) -> float:
     """Return the package's CPU time per message, s; the package reads the file in a thread.
 
-    The package passes each message to a function. A Python function, as in live use, is slow. The
-    fastest function is `list.append`, after which the messages are read together.
+    The package calls a function for each message. With `live`, this function reads the message in
+    Python, as a live program does. Otherwise it is `list.append`, the fastest function, and the
+    messages are read together at the end.
     """
     package = import_module("ximu3")  # tests use this package as a reference
     received: list[Any] = []

@@ -1,7 +1,7 @@
 """Speed of the codecs and decoders of Xbus, SLCAN and XCDI, and of python-can and cantools.
 
 All libraries are measured in the same run. No package on PyPI decodes Xbus messages. cantools
-decodes the XCDI frames from a table of the same signals, but does not group them.
+decodes the signals of single XCDI frames, but does not combine the frames of one sample.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """CPU time of a frame in each part of the daemon: compiled modules compared with their sources.
 
-Two processes run on the same tree, one of them with ``JOINTFIT_PURE=1``. They measure each part in
-turn, so the load of a shared machine affects both equally.
+Two processes run on the same compiled tree. One of them has ``JOINTFIT_PURE=1`` and therefore uses
+the Python sources. The processes measure each part in turn, so the load of a shared machine affects
+both equally.
 """
 
 from __future__ import annotations

@@ -89,7 +89,10 @@ def _inputs(seconds: float) -> list[dict[str, Quaternion]]:
 
 
 def _plainly(frames: list[dict[str, Quaternion]]) -> Callable[[], object]:
-    """Return a function that applies the array form of the corrections to one frame at a time."""
+    """Return a function that applies the correction for arrays to one frame at a time.
+
+    The daemon uses another form of the correction, for scalars.
+    """
     segments = list(worn().segment.values())
     pairs = (("S1", "S2"), ("S3", "S4"))
     models = [segments[i].models[f"{'+'.join(pairs[i])}|{'+'.join(pairs[1 - i])}"] for i in (0, 1)]
@@ -159,7 +162,7 @@ def events(rate_hz: float, seconds: float) -> list[Event]:
 
 
 def frame_times(rate_hz: float, seconds: float) -> list[float]:
-    """Return the CPU time of each limb state, s, including all its chunks."""
+    """Return the CPU time of each limb state, s: of all chunks since the previous limb state."""
     core = Core()
     core.feed(Configured(START_NS, bench_rig(rate_hz), worn(), 1))
     stream = events(rate_hz, SETTLE_S + seconds)

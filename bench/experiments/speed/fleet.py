@@ -68,7 +68,8 @@ def fleet_results(quick: bool) -> list[Result]:
         print(f"not run: {reason}", file=sys.stderr)
         return []
     with tempfile.TemporaryDirectory(prefix="jointfit-bench-") as temporary:
-        # A station that receives bursts from all gateways needs a queue of more than 1000 messages.
+        # A central computer that receives bursts of all gateways needs a queue of more than 1000
+        # messages.
         broker = MosquittoBroker(Path(temporary), more="max_queued_messages 10000\n")
         broker.start()
         try:

@@ -1,8 +1,8 @@
 """Latency while other programs use all cores, with the priorities that systemd can set.
 
-Programs in another session compute without pause, twice as many as there are cores. The settings of
-the daemon take turns. The other parts of the measurement (devices, broker, subscriber) have
-real-time priority in all settings, so only the daemon waits for a core.
+Programs in another session compute without pause; their number is twice the number of cores. The
+settings of the daemon are measured in turn. The other parts of the measurement (devices, broker,
+subscriber) have real-time priority in all settings, so only the daemon waits for a core.
 """
 
 from __future__ import annotations

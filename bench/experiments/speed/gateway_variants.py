@@ -1,6 +1,6 @@
 """CPU time of the running daemon with compiled modules, compared with the sources.
 
-The variants take turns. Each run starts all processes anew.
+Runs with compiled modules and runs with the sources alternate. Each run starts all processes again.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Growth of the core's CPU time and memory with sensors, segments, markers and run time.
 
-Each rig receives all chunks of a frame, then the chunks of the next frame. The sizes take turns, so
-a busy machine slows all of them equally. The cost of a size is the median over the turns of the
-mean CPU time of a frame.
+A size is one number of sensors, segments or markers. Each rig receives all chunks of a frame, then
+the chunks of the next frame. The sizes are measured in turn, so a busy machine slows all of them
+equally. The cost of a size is the median over the rounds of the mean CPU time of a frame.
 """
 
 from __future__ import annotations
@@ -112,13 +112,13 @@ def size_rows(
     sizes: tuple[int, ...],
     quick: bool,
 ) -> list[Result]:
-    """Return the growth exponent, the marginal cost of the largest step, and all costs."""
+    """Return the growth exponent, the cost of one more item at the largest size, and all costs."""
     costs = frame_costs({size: make(size) for size in sizes}, QUICK_ROUNDS if quick else ROUNDS)
     us = [1e6 * costs[size] for size in sizes]
     found = growth_exponent(sizes, us)
     step = (us[-1] - us[-2]) / (sizes[-1] - sizes[-2])
     return [
-        # A short run has too few frames for this threshold. It detects a very large growth only.
+        # A short run has too few frames for `LARGEST`. It detects only a very large growth.
         Result(
             f"{name}: exponent", round(found.value, 3), 1.5 if quick else LARGEST, unit="",
             note=f"± {found.half_width:.3f}, {sizes[0]} to {sizes[-1]}",
@@ -185,10 +185,11 @@ def marker_rows(quick: bool) -> list[Result]:
 def run_time_rows(quick: bool) -> list[Result]:
     """Return the growth of a frame's CPU time and instructions with the number of earlier frames.
 
-    The results are the two exponents of growth, and the instruction counts of the single blocks.
-    The time of each block of frames is divided by the time of a fixed loop just before the block,
-    so the load of the machine cancels. Each point of the regression is the median of a third of a
-    decade. The instructions are counted at the end of this third.
+    The results are the two exponents of growth, and the instruction counts of single blocks. The
+    time of each block of frames is divided by the time of a fixed loop just before the block, so
+    the load of the machine cancels. The run is divided into intervals, each of them a third of a
+    decade of frame numbers. A point of the regression is the median time of the blocks in one
+    interval. The instructions are counted at the end of each interval.
     """
     core = LoadedCore(GrowingRig(1, 1))
     frames = QUICK_FRAMES if quick else FRAMES

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import LimbState
 
 FRAMES = range(725, 1500)
-"""Frames of the example's set-up file: walking."""
+"""Frames with walking, as in the set-up file of OpenSim's example."""
 QUICK_FRAMES = range(725, 775)
 ROUNDS, QUICK_ROUNDS = 3, 1
 

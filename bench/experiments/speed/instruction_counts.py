@@ -1,8 +1,8 @@
 """Interpreted instructions of a frame in each part of the daemon, independent of machine load.
 
-Only bytecode instructions in functions of the project (pure Python) count. The counts are equal on
-every machine and at any load. They do not include work in NumPy or other C code, which the times
-include.
+Only bytecode instructions in Python functions of the project are counted. The counts are equal on
+every machine and at any load. In contrast to the measured times, they do not include work in NumPy
+or other C code.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def count_instructions(work: Callable[[], object]) -> int:
 def _per_item(
     name: str, prepare: Callable[[], Callable[[], object]], *, items: int, **_: Any
 ) -> Result:
-    """Return the instructions per item; this function replaces the measurement of time."""
+    """Return the instructions per item; this function replaces `per_item`, which measures time."""
     prepare()()  # fill the caches first
     count = count_instructions(prepare()) / items
     return Result(name, round(count, 1), round(GROWTH * KNOWN[name], 1), unit="instructions")

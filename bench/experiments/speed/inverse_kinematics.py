@@ -1,4 +1,4 @@
-"""CPU time of poses from markers: all frames at once, and one after another with covariance."""
+"""CPU time of inverse kinematics: all frames at once, and frame by frame with covariance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cost of lag tracking on the event loop, as mean and maximum of its steps."""
+"""CPU time of lag tracking on the event loop: per sample, per second of data, and longest step."""
 
 from __future__ import annotations
 

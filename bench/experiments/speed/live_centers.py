@@ -1,4 +1,4 @@
-"""Joint centers during movement: costs of a camera frame and of a progress report."""
+"""CPU time of joint centers in the functional phase: per camera frame, and per progress report."""
 
 from __future__ import annotations
 

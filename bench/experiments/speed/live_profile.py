@@ -1,8 +1,8 @@
 """CPU time of a running daemon by part of the program, sampled with py-spy.
 
-A sample counts for the innermost function of the project on the stack. Time in NumPy, orjson or the
-system therefore counts for the function that calls it. A sample without any function of the project
-counts for the event loop.
+A sample of py-spy is assigned to the innermost function of the project on the stack. Time in NumPy,
+orjson or the system is therefore assigned to the function that calls it. A sample without any
+function of the project is assigned to the event loop.
 """
 
 from __future__ import annotations
@@ -58,7 +58,8 @@ PARTS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("queue, MQTT and socket", ("jointfit_daemon/outputs/mqtt/",)),
     ("core and supervisor: distribution of events, health", ("jointfit_daemon/",)),
 )  # fmt: skip
-"""Parts of the program, each with the prefixes of its files. The first match counts."""
+"""Parts of the program, each with the prefixes of its files. A file belongs to the first part that
+matches."""
 LOOP = "event loop: asyncio, aiomqtt and waiting for events"
 
 

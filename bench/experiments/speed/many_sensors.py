@@ -1,4 +1,4 @@
-"""Running daemon with many sensors or fast sensors: every sample must be received and used."""
+"""Running daemon with many sensors or fast sensors: no sample may be lost or have no outcome."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Cost of the terminal monitor: bytes and updates per second to the terminal, and CPU time.
 
-The monitor runs in a pseudo-terminal together with simulated devices and the daemon. Sizes and
-rates take turns, so the load of the machine is the same for all of them.
+The monitor runs in a pseudo-terminal together with simulated devices and the daemon. The terminal
+sizes and update rates are measured in turn, so the load of the machine affects all of them equally.
 """
 
 from __future__ import annotations

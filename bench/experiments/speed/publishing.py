@@ -1,8 +1,8 @@
 """CPU time to publish a pose: with the daemon's connection, with aiomqtt alone, and by a socket.
 
-The broker is a thread that accepts connections and discards the received data. Only the CPU time of
-the publishing thread counts. As with poses, a message is sent after the previous message was
-accepted.
+The broker is a thread that accepts connections and discards the received data. The result is the
+CPU time of the publishing thread only. Like the daemon's poses, a message is sent after the
+previous message was accepted.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ async def _cpu_s(publish: Callable[[], Awaitable[object]]) -> float:
 
 
 async def _measure(rounds: int) -> dict[str, list[float]]:
-    """Return the CPU times of each publisher, s; the publishers take turns."""
+    """Return the CPU times of each publisher, s; the publishers are measured in turn."""
     asyncio.get_running_loop().set_exception_handler(DisconnectErrorFilter())
     times: dict[str, list[float]] = {}
     with discarding_broker() as port:

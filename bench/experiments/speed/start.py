@@ -1,4 +1,4 @@
-"""Cost of a start until a device could be opened, and of a calibration fit."""
+"""Import time of the programs, CPU time of a calibration fit, exposure of the systemd units."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """CPU time of the core with settings for weak gateways: lower rates, and no cameras.
 
-Each setting has its own rig and core. In each turn, a core processes one second of data of four
-sensors, and every pose is encoded. The settings take turns, so a busy machine slows all of them
-equally.
+Each setting has its own rig and core. The settings are measured in turn, so a busy machine slows
+all of them equally. In each turn, a core processes one second of data of four sensors, and every
+pose is encoded.
 """
 
 from __future__ import annotations

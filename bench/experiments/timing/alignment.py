@@ -2,8 +2,8 @@
 
 Samples pass through the aligner of the daemon. The simulated body (``shaken``) rotates about three
 axes at once, 550 deg/s RMS and at most 950 deg/s. ``broad`` is a recorded board that was turned by
-hand, 579 deg/s RMS. Its orientation is the integrated angular rate. Every third or fifth sample is
-used, and the others are the ground truth.
+hand, 579 deg/s RMS. The orientation of the board is its integrated angular rate. The aligner
+receives every third or fifth of these orientations, and the others are the ground truth.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def slerped_deg(period_ns: float, frames: Sequence[AlignedFrame], phase_ns: int)
 def interpolation(_data: Path) -> list[Result]:
     """Measure the interpolation error of streams of 60, 100 and 120 Hz at frames of 100 Hz.
 
-    If the phase of a stream is fixed, the frames are midway between its samples.
+    At 100 Hz, every frame is midway between two samples.
     """
     figures = []
     for rate_hz, goal in ((60.0, 0.025), (100.0, 0.008), (120.0, 0.004)):

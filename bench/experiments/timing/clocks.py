@@ -1,4 +1,8 @@
-"""Conversion of device clocks to host time, simulated with the delays of each transport."""
+"""Conversion of device clocks to host time, simulated with the delays of each transport.
+
+The clock of a camera server is fitted to echoes. An echo is a request to the server, whose answer
+contains the server's time. The clocks of sensors are fitted to the arrival times of samples.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +58,7 @@ def latency_timer(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
 def passive_run(
     seed: int, delays: Delays, seconds: float
 ) -> tuple[NDArray[np.float64], DeviceClock, NDArray[np.float64]]:
-    """Return the errors of all stamps, ms, the final clock, and the sigmas of all stamps, ms."""
+    """Return errors of all stamps, ms, the final clock, and predicted sd of all stamps, ms."""
     rng, clock = np.random.default_rng(seed), DeviceClock(PERIOD)
     n = int(seconds * S) // PERIOD
     true = START + PERIOD * np.arange(n)
@@ -106,8 +110,8 @@ def _rms(values: NDArray[np.float64]) -> float:
 def echoes(_: Path, runs: int = 200) -> list[Result]:
     """Measure the errors of a clock that is fitted to echoes.
 
-    In each direction, an echo has a delay of 0.43 ms, plus an exponential delay with a mean of
-    0.1 ms, plus, in 1 % of the cases, 20 ms.
+    In each direction, an echo is delayed by 0.43 ms and by an exponential delay with a mean of
+    0.1 ms. In 1 % of the cases, 20 ms are added.
     """
     first, last, skew = np.array([echo_run(seed) for seed in range(runs)]).T
     return [
@@ -121,7 +125,7 @@ def echoes(_: Path, runs: int = 200) -> list[Result]:
 def passive(
     delays: Delays, seconds: float, goals: tuple[float, float], runs: int
 ) -> tuple[list[Result], NDArray[np.float64], NDArray[np.float64]]:
-    """Return results of the final errors, skew errors, and errors divided by sigma."""
+    """Return results of the final errors, skew errors, and errors divided by predicted sd."""
     ends, skews, scaled = [], [], []
     for seed in range(runs):
         errors, clock, sigmas = passive_run(seed, delays, seconds)

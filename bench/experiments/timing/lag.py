@@ -1,8 +1,8 @@
 """Lag of an IMU behind the cameras, estimated from motion.
 
-In recordings, the optical data are resampled at 120 Hz with a random phase, and a random lag within
-50 ms is added to the stamps of the angular rate. The true lag of both recordings is half a frame of
-their cameras, 1/240 s.
+The optical data of the recordings are resampled at 120 Hz with a random phase. A random lag within
+±50 ms is added to the stamps of the angular rate and subtracted from the estimates. Both recordings
+have a true lag of half a camera frame, 1/240 s.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ AS_IT_IS = Treatment()
 
 
 class Window(NamedTuple):
-    """Lag estimate of one window, relative to the injected lag."""
+    """Lag estimate of one window, minus the lag that was added to the stamps."""
 
     lag_ms: float
     sigma_ms: float
@@ -198,9 +198,9 @@ def worst_ratio(name: str, ratios: Sequence[float]) -> Result:
 
 
 def quaternion_input(data: Path) -> list[Result]:
-    """Check that orientations integrated from the angular rate lead the rate by half a sample.
+    """Measure by how much integrated orientations lead the angular rate: half a sample period.
 
-    The lead is the same if the orientations are rounded.
+    The lead must be the same if the orientations are rounded.
     """
     recording = excerpt(data, FAST)
     steps = rotation.exp(recording.gyro * 0.0035)
@@ -268,9 +268,9 @@ def estimate_between(
 
 
 def sigma(_: Path) -> list[Result]:
-    """Measure ratios of error to sigma in 32 independent windows, at five levels of optical noise.
+    """Measure the ratio of the lag error to its predicted sd, at five levels of optical noise.
 
-    The simulated stamps are exact.
+    Each level has 32 independent windows. The simulated stamps are exact.
     """
     exact = LagSettings(stamp_sd_ns=0.0)
     figures = []
@@ -290,7 +290,7 @@ def sigma(_: Path) -> list[Result]:
 
 
 def track(drift: float, seed: int) -> tuple[float, float]:
-    """Return the estimated drift over two minutes and its sigma, both in ppm."""
+    """Return the estimated drift over two minutes and its predicted sd, both in ppm."""
     tracks = made_up(seed, 121.0, 5.0, drift=drift)
     tracker, tracked = LagTracker(), None
     for start_s in np.arange(0.4, 110.0, 2.5):
@@ -320,9 +320,10 @@ def drift(_: Path) -> list[Result]:
 
 
 def cost(data: Path) -> list[Result]:
-    """Measure the cost of a window of 10 s (120 and 286 Hz, median of nine) and of an update.
+    """Measure the CPU time of a lag estimate from 10 s of data, and of an update of the tracker.
 
-    The cost is the CPU time of this thread, so other processes do not affect it.
+    The data have 120 Hz (cameras) and 286 Hz (gyroscope). The first result is the median of nine
+    estimates. The CPU time of this thread is measured, so other processes hardly affect it.
     """
     recording = excerpt(data, FAST)
     part = (recording.t_ns > 10e9) & (recording.t_ns < 20e9)

@@ -1,7 +1,8 @@
 """Lag estimates of the align phase, on simulated plates that are turned by hand.
 
-Eight plates have four sensors each, with errors of filters and cameras at the settings of the demo,
-for 22 s. All streams have the same clock, so the true lag is 0.
+Eight plates have four sensors each and are turned for 22 s. The errors of orientation filters and
+cameras have the default size of the simulator. All streams have the same clock, so the true lag is
+0.
 """
 
 from __future__ import annotations

@@ -1,4 +1,8 @@
-"""Live mapping of drifting device clocks, and lag tracking with the mapped stamps."""
+"""Lag tracking with device clocks that drift.
+
+The daemon's clock models convert device time to host time. The lag is then tracked from the
+converted timestamps.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +46,7 @@ CALIBRATION = Calibration(
 
 
 class Case(NamedTuple):
-    """Skews of both clocks, and a drift of the sensor's clock that no model can detect."""
+    """Skews of both clocks, and a drift of the sensor's stamps that its clock cannot detect."""
 
     sensor_ppm: float
     cameras_ppm: float
@@ -60,7 +64,7 @@ class Found(NamedTuple):
 
 
 class _Stamps:
-    """Both clocks, which receive the same input as in the daemon."""
+    """Clock models of sensor and cameras, which receive the same input as in the daemon."""
 
     def __init__(self, case: Case, seed: int) -> None:
         self._case, self._rng = case, np.random.default_rng(seed)
@@ -92,7 +96,7 @@ class _Stamps:
 
 
 def run(case: Case, seconds: float = 121.0, seed: int = 1) -> Found:
-    """Process a moving subject's data with both clocks and lag tracking; return the result."""
+    """Convert the stamps of a moving subject's data, and track the lag; return the final result."""
     tracks, stamps = made_up(seed, seconds, 0.0), _Stamps(case, seed)
     watch, told = LagMonitor(CHAIN, CALIBRATION), []
     events: list[tuple[int, int, Quaternion]] = []
@@ -122,9 +126,10 @@ def run(case: Case, seconds: float = 121.0, seed: int = 1) -> Found:
 
 
 def drifting(_: Path) -> list[Result]:
-    """Check that clocks that differ by 100 ppm leave no drift.
+    """Check that no drift of the lag is found if the clocks differ by 100 ppm.
 
-    A drift outside the clock model is detected and reported.
+    In a second case, the stamps have a drift that the clock model cannot detect. The lag tracker
+    must detect and report this drift.
     """
     figures = []
     for case in (Case(50.0, -50.0), Case(-50.0, 50.0, 5.0)):

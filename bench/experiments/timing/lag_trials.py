@@ -1,8 +1,8 @@
 """Lag windows of all recorded trials and of short passages, and errors of the recorded stamps.
 
-The stamps of the recordings have a sawtooth error of one tick of the sensor's clock, 0.5 ms. A
-window that contains one second of fast motion covers only a part of the sawtooth, and its residuals
-do not reveal the error.
+The stamps of the recordings have a sawtooth error with the height of one tick of the sensor's
+clock, 0.5 ms. A window with one second of fast motion covers only a part of the sawtooth period, so
+the residuals of the lag fit do not show the error.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Errors of arrival stamps under load, and of every stamp of a live rig through restarts."""
+"""Errors of arrival stamps under load, and of all stamps of a rig whose devices restart."""
 
 from __future__ import annotations
 

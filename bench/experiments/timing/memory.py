@@ -1,10 +1,12 @@
 """Memory of the core, which does not grow from the first to the tenth simulated hour.
 
-The complete core processes four IMUs on UART and CAN, and cameras with one echo per second. In
-every hour, one sensor reboots and another is silent for a minute, in turn. All devices run at 5 Hz,
-so ten hours have 900 000 samples instead of 19 million. Buffers with a time limit (windows,
-histograms, buckets, echoes) fill as at full rates. Buffers with a limited number of entries are
-full within minutes.
+The complete core processes four IMUs on UART and CAN, and cameras. Once per second, an echo (a
+request and its answer with the server's time) measures the clock of the camera server. In every
+hour, one sensor reboots and the next sensor of the list is silent for a minute. From
+one hour to the next, each of these two faults moves on to the next sensor of the list. All devices
+run at 5 Hz, so ten hours have 900 000 samples instead of 19 million.
+Buffers with a time limit (windows, histograms, echoes) fill in the same time as at full rates.
+Buffers with a limited number of entries are full within minutes.
 """
 
 from __future__ import annotations
@@ -156,7 +158,7 @@ class Hardware:
 
 
 def watch(hours: float, looks_an_hour: int) -> tuple[list[Held], int, int]:
-    """Run a core for some hours; return its memory over time, samples and limb states."""
+    """Run a core for some hours; return its memory over time, and numbers of samples and states."""
     core = Core()
     made = rig()
     core.feed(Configured(BEGIN_NS, made, None))
@@ -170,7 +172,7 @@ def watch(hours: float, looks_an_hour: int) -> tuple[list[Held], int, int]:
         for event in events:
             states += sum(isinstance(output, LimbState) for output in core.feed(event))
         if minute % every == 0:
-            core.health(events[-1].chunk.t_ns)  # as in the daemon
+            core.health(events[-1].chunk.t_ns)  # the daemon also computes the health regularly
             looks.append(held(core, minute / 60))
         if minute >= 60 * hours:
             return looks, samples, states
