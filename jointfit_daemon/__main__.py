@@ -1,6 +1,6 @@
 """The command line of ``jointfitd``.
 
-Invariant: the exit code is 0 after a stop, 1 after a bug, 2 for wrong options or a faulty
+Invariant: the exit code is 0 after a requested stop, 1 after a bug, 2 for wrong options or a faulty
 configuration, and 3 if another daemon uses the state directory. Modules that only a running daemon
 needs are imported after the configuration was checked.
 """
@@ -87,7 +87,7 @@ def _lock_state_directory() -> bool:
     try:
         lock_state(state_directory())
     except StateDirectoryInUseError as error:
-        log.error("%s", error)  # noqa: TRY400 - no bug, no traceback
+        log.error("%s", error)  # noqa: TRY400 - not a bug, so no traceback
         return False
     make_private(state_directory())
     return True
@@ -117,7 +117,8 @@ def _parser() -> argparse.ArgumentParser:
 def _log_handler(rig: str, *, limited: bool) -> logging.Handler:
     """Return the log handler for the destination of standard error.
 
-    The destination is the systemd journal, another output of a service, or a terminal.
+    The destination is the systemd journal, another output of a systemd service such as a file, or a
+    terminal.
     """
     from jointfit_daemon.outputs.log import (
         JournalHandler,
@@ -159,7 +160,9 @@ def _run(config: Path, rig: Rig) -> int:
     from jointfit_daemon.supervisor.daemon import run_daemon
     from jointfit_daemon.supervisor.process_exit import ExitLimit
 
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # until the daemon has its own handler
+    # SIGHUP requests a reload. Without a handler it would end the process, so it is ignored until
+    # the daemon installs its handler.
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
     code = 0
     with asyncio.Runner() as runner:
         try:

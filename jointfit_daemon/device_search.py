@@ -3,7 +3,7 @@
 ``jointfit probe``, ``jointfit doctor`` and ``jointfit init`` call these methods. A driver class may
 implement any of them; the commands skip drivers without the method.
 
-Invariant: this module names no device.
+Invariant: this module contains no code for a particular device model.
 """
 
 from __future__ import annotations
@@ -73,13 +73,13 @@ class CanSearch(Protocol):
 
     @classmethod
     def candidate_tables(cls, seen: Mapping[tuple[int, bool], int]) -> Iterable[Mapping[str, Any]]:
-        """Return keys of ``[[imu]]`` tables that may fit, the most probable first.
+        """Return partial ``[[imu]]`` tables that may describe the sender, the most probable first.
 
         Parameters
         ----------
         seen
-            Number of data bytes of the frames with each received identifier. A key consists of the
-            identifier and a flag, which is true if the identifier has 29 bits.
+            Number of data bytes of the received CAN frames, by identifier. A key of the mapping
+            consists of the identifier and a flag, which is true if the identifier has 29 bits.
         """
 
 

@@ -1,13 +1,14 @@
 """The driver interface: settings, decoder, errors, and lookup by entry point.
 
-Invariant: this module names no device. Drivers are registered in the entry point group
-``jointfit.drivers``. A driver is imported when a rig first uses it, so a broken plug-in affects
-only rigs that use it.
+Invariant: this module contains no code for a particular device model. Drivers are registered in the
+entry point group ``jointfit.drivers``. A driver is imported when a rig first uses it, so a broken
+plug-in affects only rigs that use it.
 
-A driver has two parts. ``decoder()`` returns the pure part: it converts chunks to samples in SI
-units, without clock or port. ``run(emit)`` opens and configures the device, and reads until
-cancelled. The daemon creates a decoder when a source opens, and feeds all emitted chunks to it. A
-replay feeds the recorded chunks to a decoder instead.
+A driver has two parts. ``decoder()`` returns the pure part, which converts chunks (bytes with their
+arrival time) to samples in SI units. The pure part reads neither a clock nor a port. ``run(emit)``
+opens and configures the device, and reads until cancelled. The daemon creates a decoder when a
+source opens, and feeds all emitted chunks to it. A replay feeds the recorded chunks to a decoder
+instead.
 """
 
 from __future__ import annotations
@@ -121,7 +122,8 @@ _SLCAN_BITRATES = (
 SERIAL_ADAPTERS = ("slcan", "serial", "seeedstudio", "robotell")
 """CAN interfaces whose channel is a serial port."""
 _LONGEST_INTERFACE = 15
-"""Longest name of a network interface, bytes: IFNAMSIZ of the kernel without its NUL."""
+"""Longest name of a network interface, bytes. The constant IFNAMSIZ of the kernel also counts the
+terminating NUL."""
 INTERFACE_NAME_EXPECTED = (
     "expected the name of a network interface, as `ip link` shows it: up to "
     f"{_LONGEST_INTERFACE} bytes without slash or space"
@@ -249,7 +251,7 @@ class ImuSettings(Settings):
 
     @property
     def serial_bits_per_s(self) -> float | None:
-        """Bit rate that the samples need on a serial line, bit/s; None if no line limits them."""
+        """Bit rate that the samples need on a serial line, bit/s; None without a limiting line."""
         return None
 
     @property
@@ -284,7 +286,7 @@ class MocapSettings(Settings):
     least_delay_ms: tuple[float, float] | None = Field(
         None,
         description="smallest delay from exposure to arrival and its standard deviation, ms; for "
-        "servers without echo replies",
+        "servers that do not answer requests for their time",
     )
     sync_line: int | None = Field(
         None, description="number of the sync line with an edge at every exposure, if connected"
@@ -306,15 +308,15 @@ def device_path(settings: object) -> str | None:
 class Decoder(Protocol):
     """The pure part of a driver. No input raises an exception.
 
-    Some decoders decode motion-capture frames that they do not return. Such a decoder counts these
+    Some decoders decode motion-capture frames that they do not return. They count the withheld
     frames in three attributes of type int: ``unpublished`` (frames whose layout is not known yet),
     ``duplicates`` and ``late``.
 
-    If data cannot be decoded without earlier messages, such as the list of marker names, a decoder
-    has an attribute ``description`` of type tuple of bytes: the newest messages that describe the
-    data, in the order in which a new decoder needs them. A recording that starts while the driver
-    runs begins with these messages. Without this attribute, such a recording begins with the chunks
-    that arrived before the first measurement.
+    Some data cannot be decoded without earlier messages, such as the list of marker names. The
+    decoder of such data has an attribute ``description`` of type tuple of bytes. The attribute
+    contains the newest messages that describe the data, in the order in which a new decoder needs
+    them. A recording that starts while the driver runs begins with these messages. Without this
+    attribute, such a recording begins with the chunks that arrived before the first measurement.
     """
 
     @property

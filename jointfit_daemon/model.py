@@ -189,7 +189,8 @@ class AngleConvention(StrEnum):
     ELEVATION = "elevation"
     """Plane of elevation, elevation, axial rotation: shoulder."""
     TILT_TORSION = "tilt_torsion"
-    """Flexion and adduction as components of the tilt of the distal long axis, and torsion."""
+    """Flexion and adduction, which are the components of the tilt of the distal long axis, and
+    torsion about this axis."""
     TRUNK = "trunk"
     """Flexion, lateral bending and axial rotation of the upper segment relative to the lower
     one."""
@@ -346,7 +347,8 @@ class LimbState(NamedTuple):
     mode: FusionMode
     sync: SyncState
     flags: tuple[str, ...]
-    """Flags of the frame; a flag of one sensor, segment or joint ends in its name."""
+    """Flags of the frame. A flag that concerns one sensor, segment or joint ends in the name of
+    this object."""
     segments: tuple[SegmentState, ...]
     joints: tuple[JointState, ...]
 
@@ -434,8 +436,8 @@ class RunningCenter(NamedTuple):
     """Unit directions along which the center was not observed. Their largest component is positive.
     """
     axis: Vector | None = None
-    """Unit axis of the joint if it is a hinge: the unobserved direction if there is exactly one;
-    None otherwise."""
+    """Unit axis of a hinge joint, which is the only unobserved direction; None unless exactly one
+    direction was not observed."""
     effective_frames: float | None = None
     """Number of independent frames."""
     position: Vector | None = None
@@ -523,8 +525,8 @@ class PlanarJoint(NamedTuple):
     error: float | None
     """Predicted RMS error of the position in the plane, m."""
     arc: float | None
-    """Arc of the markers about the joint, rad; the larger of the arcs of the two adjacent
-    segments."""
+    """Arc that the markers cover about the joint, rad. It is computed in the axes of each adjacent
+    segment, and the larger value is given."""
     refused: str | None
     """Reason why there is no position, with the remedy; None if `position` is given."""
 

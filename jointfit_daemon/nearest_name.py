@@ -70,7 +70,8 @@ these keys that the table permits is suggested."""
 def nearest_key(key: object, known: Iterable[str]) -> str | None:
     """Return the key of `known` that `key` probably means; None if there is none.
 
-    A key of `known` that differs only in case and separators takes precedence over a synonym.
+    A key of `known` that differs from `key` only in case and separators takes precedence over a
+    synonym.
     """
     keys = [other for other in known if other != key]
     folded = _without_separators(str(key))

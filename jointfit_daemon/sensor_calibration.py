@@ -5,7 +5,7 @@
 The table is part of rig.toml. A recording therefore contains it, and a replay applies the same
 correction.
 
-Invariant: this module names no device.
+Invariant: this module contains no code for a particular device model.
 """
 
 from __future__ import annotations

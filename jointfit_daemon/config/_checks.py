@@ -433,7 +433,7 @@ def missing_files(mqtt: MqttSettings) -> list[str]:
 
 
 def drifting_imus(sources: Sequence[Source]) -> frozenset[str]:
-    """Return the IMUs whose heading drifts, because the gateway uses no magnetometer for it."""
+    """Return the IMUs whose heading the gateway computes without magnetometer, so it drifts."""
     return frozenset(_on_gateway(sources)[True])
 
 

@@ -159,11 +159,11 @@ class Core:
         return self._lag_ns
 
     def descriptions(self) -> dict[str, tuple[bytes, ...]]:
-        """Return the chunks that new decoders of the open sources need before further chunks."""
+        """Return, for each open source, the chunks that a new decoder needs before all others."""
         return {name: state.description() for name, state in self._sources.items()}
 
     def health(self, now_ns: int) -> CoreHealth:
-        """Return the core's part of ``bridge/health``."""
+        """Return the core's part of the MQTT topic ``bridge/health``."""
         if self._grid is None:
             return CoreHealth()
 

@@ -1,4 +1,7 @@
-"""Frame grid of a rig, which continues across reloads, and the counts of its samples.
+"""Frame grid of a rig, and the counts of its samples.
+
+The grid consists of the regular instants at which limb states are computed. It continues across
+reloads.
 
 Invariant: frames are due from the first configuration on, with or without samples, and their
 instants increase across reloads. A reload starts a new grid only if it changes rates, sensors or
@@ -18,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class FrameGrid:
-    """Owner of the frame aligner of one rig; it replaces the aligner if a reload needs a new grid.
+    """Owns the frame aligner of one rig, and replaces the aligner if a reload needs a new grid.
 
     Parameters
     ----------

@@ -1,9 +1,10 @@
 """Detection of exchanged, mislabelled and displaced markers from the shapes of marker clusters.
 
-The monitor is used for rigs without a chain model. It compares the markers with the clusters of the
-current calibration. Markers with faulty labels are hidden from fusion until they fit the clusters
-again. Invariant: a fault is reported when it has explained most frames of 2 s. Its end is reported
-after 2 s without this fault. Hidden markers neither begin nor end a fault.
+The monitor is used for rigs without a chain model. It compares the markers with the marker clusters
+of the current calibration. A cluster is the arrangement of the markers on one body part. Markers
+with faulty labels are hidden from fusion until they fit the clusters again. Invariant: a fault is
+reported when it has explained most frames of 2 s. Its end is reported after 2 s without this fault.
+Hidden markers neither begin nor end a fault.
 """
 
 from __future__ import annotations
@@ -52,10 +53,10 @@ _PRESENT = 0.6
 """Smallest share of frames that a fault must explain to begin. Markers may be hidden in the other
 frames."""
 _ABSENT = 0.1
-"""A fault or misfit ends if it occurs in at most this share of frames."""
+"""Largest share of frames in which a fault or misfit may still occur when its end is reported."""
 _REFUSED = 0.8
-"""A misfit of a body part is reported if its markers fail to fit in this share of the frames
-in which they are visible."""
+"""A misfit of a body part is reported if the markers of the part do not fit its cluster in this
+share of the frames in which the markers are visible."""
 
 
 class _Examined(NamedTuple):
@@ -63,7 +64,7 @@ class _Examined(NamedTuple):
 
     t_ns: int
     fitted: frozenset[str]
-    """Body parts with enough visible markers to determine a pose."""
+    """Body parts of which enough markers are visible to determine a pose."""
     refused: Mapping[str, float]
     """RMS residuals of the body parts whose markers do not fit, m."""
     faults: frozenset[LabelFault]
@@ -94,7 +95,8 @@ class LabelMonitor:
         self._hidden: NDArray[np.intp] = np.zeros(0, dtype=np.intp)
         """Columns of the mocap layout whose labels are faulty."""
         self.faults: dict[LabelFault, frozenset[str]] = {}
-        """Current faults, each with the body parts that must be visible before its end."""
+        """Current faults, each with the body parts that must be visible before the end of the fault
+        is reported."""
         self.misfits: frozenset[str] = frozenset()
         """Body parts whose markers do not fit for a reason that no fault in `faults` explains."""
 

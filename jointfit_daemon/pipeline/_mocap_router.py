@@ -3,8 +3,9 @@
 The consumers are the calibration, the lag monitor, online learning, and the computation of O1, the
 center of the first joint.
 
-Invariant: every frame is counted once, as used or idle. Only live frames are used. Frames are
-combined with sensor data only if their stamp is synchronized to the host clock.
+Invariant: every frame is counted once, as used or idle. Only live frames are used, not frames of a
+recording that the camera server plays back. Frames are combined with sensor data only if their
+stamp is synchronized to the host clock.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Running joint centers after calibration, with a test of the shift from calibrated centers.
+"""Continuous estimates of joint centers after calibration, and a test of their shift.
 
 Invariant: only live mocap frames change the estimates, and limb states do not depend on them.
 """
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chain, MocapFrame, Vector
 
 RATE_HZ = 20.0
-"""Number of camera frames used per second. Joints rotate by a few degrees between two of these
-frames."""
+"""Number of camera frames per second that are used. Joints rotate by a few degrees between two of
+these frames."""
 PUBLISHED_HZ = 1.0
 """Number of published results per second."""
 MOVED_P = 1e-4
@@ -47,15 +47,17 @@ nearly equals a row of the other, the two rows have one large and one small sing
 class MovingCenters:
     r"""Estimates the center of every joint from the last frames, and tests its shift.
 
-    At the time t, a frame of the time t_k has the weight :math:`e^{-(t - t_k)/T}`. The shift δ
-    between running and calibrated center is tested with the covariances C of both centers,
+    The running center of a joint is the estimate from the last frames. At the time t, a frame of
+    the time t_k has the weight :math:`e^{-(t - t_k)/T}`. The shift δ between running and calibrated
+    center is tested with the covariances C of both centers,
 
     .. math:: D^2 = \delta^T (C + C_{calibrated})^{-1} \delta \sim \chi^2_r,
 
-    over the r directions that both movements observed. Residuals from soft-tissue artefact repeat
-    with posture. In the calibrated and in the published covariance, all frames together count as
-    one observation of these residuals. The artefact displaces both centers alike, so the test
-    counts it once: its C is the random error of the running center.
+    over the r directions that were observed both by the calibration movement and by the recent
+    movement. Residuals from soft-tissue artefact repeat with posture. In the calibrated and in the
+    published covariance, all frames together count as one observation of these residuals. The
+    artefact displaces both centers alike, so the test must count it once. For the running center,
+    the test therefore uses only the covariance of the random error as C.
 
     Parameters
     ----------
@@ -182,7 +184,7 @@ def _signed(direction: Array) -> Vector:
 
 
 def _shift_test(fit: CenterEstimate, reference: CalibratedCenter) -> tuple[Array | None, float]:
-    """Return the shift along directions that both centers observed, m, and its chance.
+    """Return the shift along the directions observed for both centers, m, and its chance.
 
     The chance is the probability of a larger shift by random errors. Without a common direction,
     the result is None and 1.

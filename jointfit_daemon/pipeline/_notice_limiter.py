@@ -1,9 +1,10 @@
-"""Rate limit for notices about wires and clocks: one per minute, device and kind.
+"""Rate limit for notices about data connections and clocks: one per minute, device and kind.
 
-A condition is reported when it begins. While it lasts, its totals are reported once a minute. If
-lost samples or corrupt bytes were reported more than once, their end is reported after a minute
-without them. A notice of lost samples is a warning only if they exceed the share `MOST_LOST` of the
-samples in a minute. Notices of corrupt bytes and of clock events are always warnings.
+A condition, such as the loss of samples, is reported when it begins. While the condition lasts, its
+totals are reported once a minute. If lost samples or corrupt bytes were reported more than once,
+their end is reported after a minute without them. A notice of lost samples is a warning only if
+they exceed the share `MOST_LOST` of the samples in a minute. Notices of corrupt bytes and of clock
+events are always warnings.
 
 Invariant: the sum of the totals in all notices equals the total number of events.
 """

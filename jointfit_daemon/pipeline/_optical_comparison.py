@@ -73,7 +73,7 @@ class RunningRms:
 
 
 class OpticalComparison:
-    """Pairs mocap frames with limb states.
+    """Pairs mocap frames with limb states, and computes their differences.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ class OpticalComparison:
         self._limb = OpticalLimb(chain, calibration) if usable and calibration else None
         self._signs = [flexion_sign(joint) for joint in chain.joints]
         self._conventions = [angle_convention(chain, i) for i in range(len(chain.joints))]
-        self._rate = RateDivider(rate_hz if usable else 1.0)  # 1.0: any valid rate, never used
+        self._rate = RateDivider(rate_hz if usable else 1.0)  # 1.0 is a valid rate that is not used
         self._waiting: deque[tuple[int, int, bool, OpticalReading]] = deque(maxlen=_WAITING)
         """Instant, frame number, whether the stamp is synchronized, and the limb in the frame."""
         self._states: deque[LimbState] = deque(maxlen=_STATES)

@@ -81,7 +81,7 @@ class Tick:
 
 
 class ReplyAddress(NamedTuple):
-    """Topic and correlation data that a client requests for its reply (MQTT 5)."""
+    """Topic and correlation data that a client requests for the reply to its request (MQTT 5)."""
 
     topic: str | None = None
     """Full name of the topic; None selects ``bridge/response/COMMAND``."""
@@ -98,7 +98,7 @@ class Request:
     transaction: str
     arguments: Mapping[str, object]
     reply_to: ReplyAddress = field(default_factory=ReplyAddress)
-    """Destination of the reply, which is not part of a recording."""
+    """Destination of the reply. A recording does not contain the destination."""
 
     def refusal(self, key: str, message: str) -> Reply:
         """Return the reply that refuses this request because of a single fault."""
@@ -196,7 +196,7 @@ Event = (
 
 
 class NoticeKind(StrEnum):
-    """Subject of a notice, which is its ``kind`` on ``bridge/event``."""
+    """Subject of a notice, published as the key ``kind`` on the MQTT topic ``bridge/event``."""
 
     DEVICE = "device"
     SENSOR = "sensor"
@@ -225,7 +225,7 @@ class NoticeLevel(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """A change to report, which is published on ``bridge/event`` and logged."""
+    """A change that is logged and published on the MQTT topic ``bridge/event``."""
 
     t_ns: int
     kind: NoticeKind

@@ -1,6 +1,7 @@
-"""Health of the core at one instant: devices, clocks, lags, frames and online learning.
+"""Counters and states of the core: devices, clocks, lags, frames and online learning.
 
-Times are in nanoseconds. `jointfit_daemon.outputs.payloads` converts them for ``bridge/health``.
+Times are in nanoseconds. `jointfit_daemon.outputs.payloads` converts them for the MQTT topic
+``bridge/health``.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ class ClockHealth:
 
     state: str
     epoch: int
-    """Number of restarts of the clock."""
+    """Number of restarts and jumps of the clock."""
     offset_ns: int | None
     """Host time minus device time at the last sample, ns; None if unknown."""
     skew_ppm: float | None
@@ -136,7 +137,7 @@ class FrameCounts:
 
     sent: int = 0
     empty: int = 0
-    """Number of frames without any sensor."""
+    """Number of frames without data of any sensor."""
     skipped: int = 0
     """Number of frames omitted because the process was delayed."""
 

@@ -226,7 +226,9 @@ def normalize_cycles(t_s: Array, values: Array, cycles_s: Array, points: int = 1
     Parameters
     ----------
     t_s : ndarray, shape (n,)
+        Instants of the series, s.
     values : ndarray, shape (n,)
+        Values at these instants.
     cycles_s : ndarray, shape (k, 2)
         Start and end of each cycle, s.
     points : int

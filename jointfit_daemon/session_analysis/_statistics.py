@@ -155,6 +155,7 @@ def series_quality(t_s: Array, known: NDArray[np.bool_] | None = None) -> Series
     Parameters
     ----------
     t_s : ndarray, shape (n,)
+        Instants of the rows, s.
     known : ndarray, shape (n,), optional
         Mask of the rows to count; by default all rows.
     """

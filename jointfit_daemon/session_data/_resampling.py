@@ -83,7 +83,9 @@ def _period(t_s: Array) -> float:
 
 
 def rows_on_axis(t_s: Array, axis_s: Array) -> NDArray[np.intp] | None:
-    """Return the row of a uniform axis for every instant, or None if an instant has no own row.
+    """Return the row of a uniform axis at which each instant lies.
+
+    The result is None if an instant lies at no row, or if two instants lie at the same row.
 
     Parameters
     ----------

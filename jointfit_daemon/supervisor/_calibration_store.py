@@ -137,7 +137,7 @@ class CalibrationWriter:
         self._begin(*self._unwritten)
 
     def retry(self) -> None:
-        """Write again, at once, a calibration whose write failed; do nothing if there is none."""
+        """Repeat a failed write at once; do nothing if no write has failed."""
         if self._next_try is not None:
             self._next_try.cancel()
             self._next_try = None

@@ -1,7 +1,8 @@
 """Passes events and time to the core, and distributes the core's outputs to the sinks.
 
 Invariant: events are processed one at a time in the order of arrival, and each sink receives an
-event before the core. An exception of the core is a bug, which propagates and ends the daemon.
+event before the core processes it. An exception of the core is a bug, which propagates and ends the
+daemon.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class CoreInterface(Protocol):
         """Process one event and return its outputs."""
 
     def descriptions(self) -> Mapping[str, tuple[bytes, ...]]:
-        """Chunks that new decoders of the open sources need before further chunks."""
+        """Return, for each open source, the chunks that a new decoder needs before all others."""
 
     def health(self, now_ns: int) -> CoreHealth:
         """Return counters and clock estimates."""

@@ -1,5 +1,7 @@
 """Sinks that rig.toml or a request enables: recording, metrics, Lab Streaming Layer (LSL).
 
+A sink receives the input events and the outputs of the core (`outputs.sink`).
+
 Invariant: a sink that cannot start is reported, and the daemon runs without it.
 """
 

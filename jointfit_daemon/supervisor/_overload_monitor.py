@@ -29,7 +29,8 @@ class OverloadMonitor:
     """Compares delays of the event loop and health reports with the limits of this module."""
 
     def __init__(self) -> None:
-        self._stalls, self._longest_s = 0, 0.0  # number and longest, since the last warning
+        self._stalls, self._longest_s = 0, 0.0
+        """Number of stalls since the last warning, and duration of the longest, s."""
         self._stalled = False  # whether a stall occurred since the last health report
         self._stall_due_s = self._due_s = -inf
         self._counts = (0, 0, 0)  # connections, sent and dropped messages at the last report

@@ -52,7 +52,8 @@ class ExitLimit:
         if not self._started.get():
             return
         time.sleep(self._seconds)
-        # Standard error may be a pipe that no process reads, so that its lock is never released.
+        # If standard error is a pipe that no process reads, a write blocks without limit. The
+        # report is therefore written in a separate thread.
         report = threading.Thread(target=self._report, daemon=True)
         report.start()
         report.join(_REPORT_S)

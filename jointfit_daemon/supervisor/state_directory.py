@@ -42,9 +42,9 @@ def state_directory() -> Path:
 def lock_state(directory: Path) -> int | None:
     """Lock `directory` for this process, and return the descriptor that owns the lock.
 
-    Return None if no lock file can be created, because a directory without write access contains no
-    state to protect. On network file systems without locks, the descriptor of the file is
-    returned without a lock.
+    Return None if no lock file can be created. A directory without write access contains no state
+    to protect. On network file systems without locks, the descriptor of the file is returned
+    without a lock.
 
     Raises
     ------

@@ -3,11 +3,11 @@
     (1436509052.249713) can0 105#2A366C2B       eight identifier digits: 29 bits; #R: remote
     (1436509052.249713)  can0  105   [4]  2A 36 6C 2B       without -L; the time may be missing
 
-A chunk is one record of `jointfit_protocols.can` with 24 bytes: i64 time in ns, u32
-identifier, u8 flags, u8 size, two zeros, eight data bytes. This module packs the record itself,
-because the daemon does not import wire formats. A test compares both implementations. A line that
-is not a classic CAN frame becomes a record that states the number of its bytes, so that the decoder
-counts them as lost.
+A chunk is one record of `jointfit_protocols.can` with 24 bytes: i64 time in ns, u32 identifier, u8
+flags, u8 size, two zero bytes, eight data bytes. This module packs the record itself, because the
+daemon does not import wire formats. A test compares both implementations. A line that is not a
+classic CAN frame becomes a record that states the number of its bytes, so that the decoder counts
+them as lost.
 """
 
 from __future__ import annotations

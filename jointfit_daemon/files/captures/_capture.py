@@ -5,13 +5,13 @@ The file type is determined from the first bytes, not from the name:
 | file | wire | chunks |
 |---|---|---|
 | pcapng, pcap | datagram | one per UDP datagram, both directions, with the time of the packet |
-| pcapng, pcap | datagram, split | also one per packet in one direction of a TCP connection |
+| pcapng, pcap | datagram, split | as above, and one per packet in one direction of a connection |
 | pcapng, pcap | stream | one per segment in one direction of a TCP connection |
 | pcapng, pcap | can | one per classic CAN frame of a SocketCAN link |
 | ``candump`` text | can | one per line, a record of `jointfit_protocols.can` |
 | raw bytes | stream | one per 4096 bytes; the times are computed for 921 600 baud |
 | raw bytes | datagram, split | one per packet |
-| raw bytes | datagram | one per message ``u16 id, u16 length, …`` if these fill the file; or one |
+| raw bytes | datagram | one per message ``u16 id, u16 length, …``; else one for the whole file |
 | raw bytes | can | one per 170 records of `jointfit_protocols.can` |
 
 *Split* marks a driver with a `packet_stream`, whose chunks are packets of a TCP connection.
@@ -187,7 +187,10 @@ def _require_wire(path: Path, found: str, recorded: Wire, expected: Wire) -> Non
 
 
 def _walk(data: bytes) -> Iterator[Chunk]:
-    """Yield a chunk per message ``u16 id, u16 length, …`` if these fill the file, or one chunk."""
+    """Yield a chunk per message ``u16 id, u16 length, …``.
+
+    If such messages do not fill the file exactly, yield the whole file as one chunk.
+    """
     cuts = [0]
     while cuts[-1] + 4 <= len(data):
         (size,) = struct.unpack_from("<H", data, cuts[-1] + 2)

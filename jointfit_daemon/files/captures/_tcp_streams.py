@@ -6,7 +6,7 @@ hole do not continue the bytes before it. Most servers begin a packet with a new
 search for packets restarts at the first segment after the hole.
 
 Invariant: all functions are pure; at most `_MOST_WAITING` segments of a direction wait for an
-earlier one.
+earlier segment.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ class LoadedModel:
     """Names of the coordinates of each segment. They are taken from an OpenSim model, or else
     derived from the segment name."""
     remarks: tuple[str, ...] = ()
-    """Descriptions of the differences from the OpenSim model."""
+    """Remarks on the model, such as differences from the OpenSim model."""
 
 
 def load_model(path: Path) -> LoadedModel:

@@ -222,7 +222,7 @@ class _Tree:
         return found
 
     def coordinates(self, segment: Segment) -> JointCoordinates:
-        """Return the coordinates of a kept segment; six free ones if its parent is omitted."""
+        """Return the coordinates of a kept segment; six free ones without its parent segment."""
         was_cut = segment.parent is None and (
             segment.name not in self._joints
             or self._at[self._joints[segment.name][0].parent.body][0] is not None

@@ -1,8 +1,8 @@
 """Plausibility check of lengths in model files.
 
-A file with millimetres, without a unit or with a declared unit of metres, would yield a chain that
-is a thousand times too large. No point of a human body segment is ten metres from the segment's
-origin, so files with such points are rejected.
+If a file contains millimetres, but declares metres or no unit, the chain would be a thousand times
+too large. No point of a human body segment is ten metres from the segment's origin, so files with
+such points are rejected.
 """
 
 from __future__ import annotations

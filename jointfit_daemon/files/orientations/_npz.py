@@ -51,9 +51,10 @@ class OrientationTrial:
     t_s: NDArray[np.float64]
     """Times, s, shape (n,)."""
     sensors: Mapping[str, NDArray[np.float64]]
-    """Sensor orientations q_world_sensor by id, shape (n, 4), unit; NaN where missing."""
+    """Sensor orientations q_world_sensor by id, unit quaternions, shape (n, 4); NaN where
+    missing."""
     bones: Mapping[str, NDArray[np.float64]]
-    """Segment orientations q_world_segment by bone, shape (n, 4), unit."""
+    """Segment orientations q_world_segment by bone, unit quaternions, shape (n, 4)."""
     origins: Mapping[str, NDArray[np.float64]]
     """Origin of each bone (the proximal joint center), m, shape (n, 3)."""
 

@@ -2,7 +2,7 @@
 
 Every channel names the object to which it belongs (sensor, marker, segment or joint), its quantity,
 its component and its unit. Invariant: `session_of` converts the streams of `streams_of` back to the
-same session.
+same series of sensors, markers, segments and joints. Modes and flags of frames have no stream.
 """
 
 from __future__ import annotations

@@ -4,8 +4,9 @@ Lines ``NAME:,VALUE`` precede the column names. The reader uses ``DeviceTag``, `
 ``SyncStatus``. ``SampleTimeFine`` is a 32-bit time of the row in units of 1 µs, so it wraps after
 71.6 minutes. Angular rates are in degrees per second. The world is east, north, up; quaternions
 convert from sensor to world. Output modes without angular rate and acceleration contain increments
-``dq`` and ``dv`` for each row. An increment divided by its period is the mean rate. Source: header
-and columns of published files and programs. No recording of this project was available for tests.
+``dq`` and ``dv`` for each row. An increment divided by its period is the mean rate. The format was
+derived from the headers and columns of published files and from published programs. The project has
+no DOT recording of its own for tests.
 """
 
 from __future__ import annotations

@@ -77,8 +77,8 @@ def write_sto_session(
             else None,
         )
         quaternions = np.stack(columns, axis=1)
-        # Sensors rarely start at the same instant, but IMUPlacer needs all of them in the first
-        # frame.
+        # Sensors rarely start at the same instant, but OpenSim's tool IMUPlacer needs all of them
+        # in the first frame.
         starts = [t_s[0] for _, t_s, _ in series]
         late_s = max(starts) if max(starts) - min(starts) <= _LATE_START_S else min(starts)
         rows = ~np.isnan(quaternions).all(axis=(1, 2))

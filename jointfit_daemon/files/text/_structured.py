@@ -1,8 +1,8 @@
 """Reading of TOML and JSON files from untrusted sources, with limited size and depth.
 
 Invariant: the only exception that a file causes is `MalformedFileError`. Readers read at most
-`most_bytes`, never wait for a writer, and reject values nested so deeply that later code would
-exceed the recursion limit.
+`most_bytes`, never wait for the writer of a FIFO, and reject values nested so deeply that later
+code would exceed the recursion limit.
 """
 
 from __future__ import annotations

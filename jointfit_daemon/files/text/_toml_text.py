@@ -26,7 +26,7 @@ def toml_value(value: Any, *, hexadecimal: bool = False) -> str:
     value
         Text, number, Boolean, list, tuple or mapping.
     hexadecimal
-        Whether integers are written as ``0x1a``.
+        Whether integers are written as ``0x1a``. Integers in lists are always decimal.
     """
     if isinstance(value, bool):
         return "true" if value else "false"

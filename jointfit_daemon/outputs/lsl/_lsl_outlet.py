@@ -67,7 +67,7 @@ class LslOutlet:
             ``pylsl`` or its library liblsl is not installed.
         """
         try:
-            import pylsl  # noqa: PLC0415 - an extra
+            import pylsl  # noqa: PLC0415 - optional package
         except ModuleNotFoundError as missing:
             raise LslError(
                 "the package pylsl is missing: pip install 'jointfitd[lsl]'"

@@ -74,7 +74,7 @@ class MetricsServer:
             ``prometheus_client`` is not installed, or the address is not available.
         """
         try:
-            from prometheus_client import (  # noqa: PLC0415 - an extra
+            from prometheus_client import (  # noqa: PLC0415 - optional package
                 CollectorRegistry,
                 make_wsgi_app,
             )
@@ -110,7 +110,7 @@ class MetricsServer:
 
     def _take(self) -> Iterator[Any]:
         """Return the metrics of this instant. The thread of the server calls this method."""
-        from jointfit_daemon.outputs.metrics._families import (  # noqa: PLC0415 - an extra
+        from jointfit_daemon.outputs.metrics._families import (  # noqa: PLC0415 - optional package
             metric_families,
         )
 

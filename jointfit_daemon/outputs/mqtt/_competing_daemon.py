@@ -6,14 +6,15 @@ connects with another client id and waits for messages of another daemon. If it 
 message, it publishes nothing until the other daemon ends.
 
 This check fails if two daemons start together, or if the broker has lost the state of a daemon. In
-these cases the daemon that was connected first connects again with its client id. The newer daemon
-must give way: it connects with another client id and waits until the other daemon is gone.
+these cases the daemon that was connected first, the older daemon, connects again with its client
+id. The newer daemon must give way: it connects with another client id and waits until the other
+daemon is gone.
 
 Neither daemon knows when the other daemon connected. Each daemon compares the duration of its own
 first connection with a limit that doubles with every further loss. The first connection of the
-newer daemon lasts only until the first daemon reconnects. The newer daemon is therefore the first
-whose duration is below the limit. Only the disconnected daemon decides, while the other daemon is
-connected, so the two daemons never give way at the same time.
+newer daemon lasts only until the older daemon reconnects. The newer daemon is therefore the first
+of the two daemons whose duration is below the limit. Only the disconnected daemon decides, while
+the other daemon is connected, so the two daemons never give way at the same time.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ GLANCE_S = 2.0
 """Time to wait for a pose of the suspected daemon, s."""
 SETTLED_S = 5.0
 """Time without another message after which the state ``offline`` is accepted, s. The message may be
-the will of this daemon's own last connection."""
+the will of this daemon's last connection, which the broker publishes if the connection breaks."""
 
 
 class TakeoverDetector:

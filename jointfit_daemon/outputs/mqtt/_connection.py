@@ -538,7 +538,7 @@ class _Client(aiomqtt.Client):
         # The library writes the rest of this message before any other message.
         sent = MQTTMessageInfo(client._mid_generate())  # noqa: SLF001 - it has no public equivalent
         self._await_acceptance(sent.mid, accepted)
-        client._packet_queue(PUBLISH, packet[written:], sent.mid, 0, sent)  # noqa: SLF001 - also
+        client._packet_queue(PUBLISH, packet[written:], sent.mid, 0, sent)  # noqa: SLF001 - no public equivalent
         return True
 
     def _await_acceptance(self, mid: int, accepted: Callable[[str | None], None]) -> None:

@@ -6,9 +6,9 @@ counted.
 There are five kinds of messages, which are sent in this order of priority. Responses come first,
 because a client waits for them. State messages are retained: the last value of a topic replaces
 earlier values, and all state is sent again on every connection. Events are sent in order. Stream
-messages are useless when late. Late messages come from the spool, which waits for their delivery.
-Responses, events and stream messages are dropped when they have waited longer than their expiry
-time.
+messages are useless when late. Late messages were stored by the spool during an outage of the
+broker. The spool waits for their delivery. Responses, events and stream messages are dropped when
+they have waited longer than their expiry time.
 
 The outbox can send several messages before the first of them is acknowledged. After the connection
 is lost, responses, events and late messages without an acknowledgement are sent again. They may

@@ -96,7 +96,7 @@ class PacketLimitSocket:
                 self._header, self._excess_bytes = b"", length
                 continue
 
-            # A message is admitted by its topic, which is at the start of the packet.
+            # The topic decides whether a message is admitted. It is at the start of the packet.
             asks = self._admit is not None and self._header[0] & _TYPE == _PUBLISH
             if asks and not self._read_topic(length):
                 return False

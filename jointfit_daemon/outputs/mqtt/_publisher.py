@@ -204,8 +204,9 @@ class MqttPublisher:
                 delay_s = _FIRST_RETRY_S
 
             try:
-                # A takeover closes the connection. A missing answer of the broker is therefore not
-                # caused by a takeover.
+                # In a takeover, another client connects with this client id, and the broker closes
+                # the connection. A missing answer of the broker is therefore not caused by a
+                # takeover.
                 silent = NO_ANSWER in reason
                 if silent or not await self._pause_if_competing(lasted_s):
                     self._report_loss(reason, lasted_s)

@@ -166,7 +166,9 @@ class OpticalChain(Payload):
     t_us: Time
     frame: int
     model: str
-    refined: Any = Field(description="refinement of the model in use")
+    refined: Any = Field(
+        description="whether the marker positions come from the current calibration"
+    )
     coordinates: dict[str, ChainCoordinate]
     covariance: ChainCovariance | None = None
     error_m: dict[str, Number]

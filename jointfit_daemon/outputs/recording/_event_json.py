@@ -1,7 +1,7 @@
 """JSON form of the input events and outputs of the core in a recording.
 
-Invariant: conversion to JSON and back returns an equal event. The bytes of a `ChunkArrived` are
-recorded unchanged, not as JSON.
+Invariant: conversion to JSON and back returns an equal event, except for the reply address of a
+request. The bytes of a `ChunkArrived` are recorded unchanged, not as JSON.
 """
 
 from __future__ import annotations

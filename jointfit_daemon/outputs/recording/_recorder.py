@@ -87,8 +87,8 @@ class Recorder:
     autostart
         Whether recording starts with the first event.
     describe
-        Function that returns the chunks that new decoders of the open sources need before further
-        chunks, by source.
+        Function that returns, for each open source, the chunks that a new decoder needs before all
+        others.
     """
 
     def __init__(

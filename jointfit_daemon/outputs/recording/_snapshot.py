@@ -46,7 +46,7 @@ class Snapshot:
     descriptions: Mapping[str, tuple[bytes, ...]] = field(
         default_factory=lambda: MappingProxyType({})
     )
-    """Chunks that new decoders of the open sources need before further chunks, by source."""
+    """For each open source, the chunks that a new decoder needs before all others."""
 
     def after_event(self, event: Event) -> Snapshot:
         """Return the state after an input event."""

@@ -119,8 +119,7 @@ class CalibrationSession:
         self.refits = OnlineRefits()
 
     def resume(self, before: CalibrationSession, *, same_rig: bool) -> None:
-        """Continue the session `before` a reload; keep its alignment and static pose if
-        `same_rig`."""
+        """Continue the session of `before`; keep its alignment and static pose if `same_rig`."""
         self._jobs = before._jobs  # job numbers are never reused
         if same_rig:
             self._alignment, self._static = before._alignment, before._static

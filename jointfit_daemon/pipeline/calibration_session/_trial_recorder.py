@@ -68,7 +68,7 @@ def _increasing(t_ns: np.ndarray) -> np.ndarray:
 
 
 def _optical_track(frames: list[tuple[int, MocapFrame]]) -> OpticalTrack:
-    """Merge frames of one or more layouts by name; NaN for names that a layout does not contain."""
+    """Merge frames of one or more layouts by name; names that a layout lacks become NaN."""
     layouts = dict.fromkeys(frame.layout for _, frame in frames)
     markers = tuple(dict.fromkeys(name for layout in layouts for name in layout.markers))
     bodies = tuple(dict.fromkeys(name for layout in layouts for name in layout.bodies))

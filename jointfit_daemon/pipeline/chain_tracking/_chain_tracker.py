@@ -1,6 +1,7 @@
 """Inverse kinematics of a chain model from single mocap frames, at a limited rate.
 
-Invariant: the result depends neither on an IMU nor on a calibration of the limb.
+Invariant: the result does not depend on IMUs. A calibration of the limb affects it only through
+refined marker positions.
 """
 
 from __future__ import annotations

@@ -76,8 +76,8 @@ class OnlineFrameCollector:
     chain : Chain
         The limb.
     calibration : Calibration or None
-        The current calibration. No frame is collected if there is no calibration, if it contains
-        no movement data, or if it lacks the marker clusters of a segment.
+        The current calibration. No frame is collected without a calibration, or if the calibration
+        contains no movement data or lacks the marker clusters of a segment.
     wanted : bool
         Value of ``learn_online`` in rig.toml.
     """

@@ -52,8 +52,8 @@ class MissingPose(NamedTuple):
     markers: tuple[str, ...] = ()
     """Visible markers, in a frame with a fault."""
     renewed: bool = False
-    """Whether the labels are used as they are from the next frame on, so that the joint centers
-    must be estimated again."""
+    """Whether the present labels are accepted from the next frame on. The joint centers must then
+    be estimated again."""
 
 
 @dataclass(slots=True)

@@ -74,7 +74,7 @@ class _Side:
     """One circle fit for each marker of the other body part."""
     estimate: CenterEstimate | None = None
     radii: list[float] = field(default_factory=list)
-    """Distance of each marker from its center, m; NaN if the center of the marker is refused."""
+    """Radius of the circle of each marker, m; NaN if the circle fit of the marker is refused."""
 
     def clear(self) -> None:
         """Discard all frames and the estimate."""

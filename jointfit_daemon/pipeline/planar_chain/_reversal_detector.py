@@ -23,8 +23,8 @@ GAP_NS = 200_000_000
 """Time between two poses from which labels may have been exchanged without a visible rotation,
 ns."""
 KEPT_NS = 60_000_000_000
-"""Time after which exchanged or undecided labels are used as they are, ns. In this case, the labels
-before the exchange or the joint centers may be wrong."""
+"""Time after which exchanged or undecided labels are accepted, ns. After such a long time, the
+earlier labels or the joint centers may be wrong instead."""
 _EXCHANGE_RAD = 2.5
 """Rotation between two frames above which the labels must have been exchanged, rad."""
 _LARGEST_M = 0.15
@@ -68,7 +68,7 @@ class Labels(Enum):
     EXCHANGED = "exchanged"
     UNDECIDED = "undecided"
     RENEWED = "renewed"
-    """The labels are used as they are. They may contradict the labels of earlier frames."""
+    """The labels are accepted, although they may contradict the labels of earlier frames."""
 
 
 @dataclass(slots=True)

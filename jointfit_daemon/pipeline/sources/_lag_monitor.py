@@ -90,7 +90,7 @@ class _Window(NamedTuple):
 
 
 class _SegmentTrack(NamedTuple):
-    """Orientations of a segment in one window, computed from its markers for all its sensors."""
+    """Orientations of a segment in one window, from its markers, for all sensors on it."""
 
     end_ns: int
     """End of the window, ns."""
@@ -127,7 +127,8 @@ class LagMonitor:
     before : LagMonitor, optional
         Monitor whose estimates are continued, because a new calibration does not change the clocks.
     known : mapping, optional
-        Lags from rig.toml. They are used instead of estimated lags, which only check them.
+        Lags from rig.toml. They are used instead of the estimated lags. The estimated lags then
+        only serve to check them.
     """
 
     def __init__(

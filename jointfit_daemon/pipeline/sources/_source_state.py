@@ -1,7 +1,8 @@
 """State of one source in the core: decoder, clock and counters.
 
-The state converts chunks to stamped samples, and counts losses and errors. It does not depend on
-frames or the calibration, and depends on other sources only through sync lines.
+The state converts chunks to samples with timestamps, and counts losses and errors. It does not
+depend on frames or the calibration. It depends on other sources only through sync lines, which are
+wires with pulses that several devices timestamp.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ WITHHELD = ("unpublished", "duplicates", "late")
 
 
 MOST_OPENING_BYTES = 65536
-"""Largest size of the kept chunks that arrived before the first measurement, bytes."""
+"""Largest total size of the stored chunks that arrived before the first measurement, bytes."""
 KEPT_SAMPLES = 1000
 """Number of samples and events after a reopening for which the time base of the previous decoder
 may be used."""
@@ -193,7 +194,7 @@ class SourceState:
         return items
 
     def description(self) -> tuple[bytes, ...]:
-        """Return the chunks that a new decoder needs before further chunks; empty while closed.
+        """Return the chunks that a new decoder needs before all others; empty while closed.
 
         See `jointfit_daemon.driver.Decoder`.
         """
@@ -268,7 +269,7 @@ class SourceState:
         return events
 
     def _identity_events(self, item: Corrupt | DeviceEvent) -> list[DeviceEvent]:
-        """Return a warning if the device is not the calibrated sensor, by its serial number."""
+        """Return a warning if the serial number is not that of the calibrated sensor."""
         if not isinstance(item, DeviceEvent) or item.kind != "info" or "serial" not in item.data:
             return []
         text = exchanged_sensor(self.source.settings, item.data["serial"])

@@ -1,10 +1,10 @@
 """Sync lines of a rig: edges from different sources are assigned to common instants.
 
-The reference of a line is the mocap source whose table names the line (``sync_line``), because it
-sends one edge per exposure. Without such a source, the reference is the first source whose edge
-arrives. If this reference is silent for `SYNC_STALE_NS`, the next source whose edge arrives
-replaces it. The clocks of all other sources on the line are synchronized to the clock of the
-reference.
+A sync line is a wire on which all connected devices timestamp the same pulse edges. The reference
+of a line is the mocap source whose table names the line (``sync_line``), because this source sends
+one edge per exposure. Without such a source, the reference is the first source whose edge arrives.
+If this reference is silent for `SYNC_STALE_NS`, the next source whose edge arrives replaces it. The
+clocks of all other sources on the line are synchronized to the clock of the reference.
 
 Invariant: the result depends only on the edges, the clocks, and their order of arrival.
 """

@@ -1,8 +1,8 @@
-"""Authentication of requests by signature and nonce.
+"""Authentication of requests by a signature and a nonce, which is a text that is used only once.
 
-Invariant: if no key can be used, every request is refused. Each signed request is accepted once,
-and the number of stored nonces is limited. Without ``[mqtt] request_key_file``, all requests are
-accepted; only the broker's access list can then restrict them.
+Invariant: if a key is configured but cannot be used, every request is refused. Each signed request
+is accepted once, and the number of stored nonces is limited. Without ``[mqtt] request_key_file``,
+all requests are accepted; only the broker's access list can then restrict them.
 """
 
 from __future__ import annotations

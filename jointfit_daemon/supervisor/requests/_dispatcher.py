@@ -1,7 +1,8 @@
 """Executes each request once, and answers its repetitions with the first answer.
 
-Invariant: every received request gets one answer. A request with the same transaction as an earlier
-request is not executed. The number of stored transactions and their storage time are limited.
+A transaction is a text with which a client identifies its request. Invariant: every received
+request gets one answer. A request with the same transaction as an earlier request is not executed.
+The number of stored transactions and their storage time are limited.
 """
 
 from __future__ import annotations

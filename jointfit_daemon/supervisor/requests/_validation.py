@@ -42,7 +42,8 @@ _MOST_FAULTS = 8
 _LONGEST_KEY, _LONGEST_MESSAGE = 80, 400
 """Longest key and longest message in a reply, characters."""
 _COMMAND = re.compile(r"[A-Za-z0-9_-]{1,32}")
-"""Pattern of command names. Names that do not match are not repeated on a topic."""
+"""Pattern of command names. A request with another name gets no reply, because the name would
+become part of the topic of the reply."""
 _RESPONSE_LEVELS = re.compile(r"[\w.:~-]{1,64}(/[\w.:~-]{1,64}){0,3}", re.ASCII)
 """Pattern of the topic levels below ``bridge/response/`` that a client may request."""
 

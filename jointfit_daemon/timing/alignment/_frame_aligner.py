@@ -7,13 +7,13 @@ Frame k has the instant ``t_k = k period`` of host CLOCK_MONOTONIC, so the grid 
 the start time. The frame is emitted when every active stream has a sample at or after t_k, or at
 the deadline of the frame. Each stream has a deadline: the usual arrival of its next sample plus at
 most 1.5 of its periods. The deadline of the frame is the latest deadline of a stream. If a sample
-is missing, the orientation of its stream is extrapolated by up to 2.5 periods. Frames after this
-time do not contain the stream.
+is missing, the orientation of its stream is extrapolated by up to 2.5 periods. Frames later than
+this limit do not contain the stream.
 
 Invariant: frames never stop. While no stream has samples, frames without orientations are emitted.
 The first of these frames is emitted when every stream counts as lost. Each later frame waits for
 the usual delay of the streams. Frames without orientations are skipped only if the whole process
-was stopped for more than a second, so that the caller could not request them.
+was stopped for more than a second. The caller could not request these frames in time.
 
 In mode ``fast`` a frame is complete if the last sample of each stream precedes t_k by at most one
 period of the stream. The orientation is extrapolated to t_k. Frames are therefore emitted up to one
@@ -97,8 +97,9 @@ class FrameAligner:
         self._fast = mode == "fast"
         self._next = None if begin_ns is None else -(-begin_ns // period_ns)
         """Number k of the next frame; None before the first sample."""
-        self._served: int | None = None  # number k of a frame with data
-        self._serves_ns: int | None = None  # first instant with data, from the next frame on
+        self._served: int | None = None  # number k of a frame that has data
+        self._serves_ns: int | None = None
+        """First instant, from the next frame on, for which a stream has data, ns."""
         self._completed_ns = 0
         self._synced = False
         """Whether the clocks of the last frame had settled."""

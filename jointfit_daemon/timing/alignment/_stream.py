@@ -37,7 +37,7 @@ LOST_LEAST_NS = 50_000_000
 FUTURE_NS = 100_000_000
 """Largest time by which a valid timestamp may be later than the arrival of the sample, ns."""
 PAST_NS = 10_000_000_000
-"""Age at the arrival above which a sample is too late for live use, ns."""
+"""Largest time from sampling to arrival of a sample for live use, ns. Older samples are late."""
 DELAY_MOST_NS = 250_000_000
 """Largest delay that frames wait for, ns."""
 
@@ -158,7 +158,7 @@ class Stream:
         self._delay_ns = delay_ns
         samples.append(sample)
         self.newest_ns, self.waited_for = t_ns, True
-        if arrival_ns > self.newest_arrival_ns:  # noqa: PLR1730 - max() costs more
+        if arrival_ns > self.newest_arrival_ns:  # noqa: PLR1730 - max() takes longer
             self.newest_arrival_ns = arrival_ns
         if len(samples) > CAPACITY:
             self._leave(samples.popleft(), SampleOutcome.DROPPED)

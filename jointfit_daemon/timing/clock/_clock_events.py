@@ -130,7 +130,7 @@ def skew_warning(kind: str, skew_ppm: float, sigma_ppm: float) -> ClockEvent | N
     Parameters
     ----------
     kind : {"ticks", "samples", "echo"}
-        Source of the clock.
+        Source of the clock estimate: device ticks, sample numbers, or echoes (see `EchoFit`).
     skew_ppm, sigma_ppm : float
         Skew and its standard deviation, ppm.
     """

@@ -61,7 +61,7 @@ class DelayStatistics:
             half.first_ns = arrival_ns
         half.count += 1
         half.last_ns = arrival_ns
-        if delay_ns > half.worst:  # noqa: PLR1730 - max() costs more than the rest of the method
+        if delay_ns > half.worst:  # noqa: PLR1730 - max() takes longer than the rest of the method
             half.worst = delay_ns
         half.bins[bin_of(delay_ns)] += 1
 

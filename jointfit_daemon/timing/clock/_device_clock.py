@@ -3,12 +3,12 @@
 Every sample gets a timestamp, in order of arrival. The computation takes a few microseconds per
 sample, and memory is constant.
 
-The model is ``t(u) = u + c + s (u - u_0)``, where u is the device time in ns, c the offset and s
-the skew. The first available source of this list is used:
+The model is ``t(u) = u + c + s (u - u_0)``, where u is the device time in ns, c the offset at the
+device time u_0, and s the skew. The first available source of this list is used:
 
 1. sync edges, or a device clock declared to be the host clock (``_direct_time``);
-2. echoes (``_echo_fit``). The error of c is then half the difference between the delays of request
-and reply;
+2. echoes, which are requests that the device answers with its time (``_echo_fit``). The error of c
+is then half the difference between the delays of request and reply;
 3. the minimum-delay filter on arrivals (``_minimum_delay``). The error of c is then the minimum
 delay D_min. The prior mean of D_min, `latency_ns`, is subtracted. The remaining delay is part of
 the lag that ``timing.lag`` estimates from motion.
@@ -48,15 +48,15 @@ ABSENT_LIMIT = 100
 """Number of consecutive samples without their usual device time before the clock changes its
 source."""
 CAUGHT_UP_NS = 50_000
-"""Largest distance of a timestamp from its estimate at which the clock becomes synced, ns."""
+"""Largest difference between a timestamp and its estimate at which the clock becomes synced, ns."""
 AWAY_SLACK_NS = 500_000_000
 """Tolerance of the first device time after the port was closed, ns. Bytes may have been buffered
 while the port was closed.
 """
 AWAY_TURNS = 20
-"""Least period of the device readings for the detection of a restart, in multiples of the tolerance
-of the first device time after the port was closed. Readings with a shorter period would hide a
-restart by chance in more than one of ten cases.
+"""Least period after which the device readings repeat, in multiples of the tolerance of the first
+device time after the port was closed. With a shorter period, a restart cannot be detected, because
+the readings would hide it by chance in more than one of ten cases.
 """
 
 _ARRIVAL, _COUNTER, _TICKS = range(3)
@@ -67,8 +67,8 @@ _ARRIVAL_SIGMA = 0.1
 _PRIOR_SIGMAS = 4.0
 """Largest accepted difference between direct time and the estimate, in standard deviations."""
 _AWAY_SHARES = 0.0, 0.02, 0.001
-"""Additional tolerance of the first device time after the port was closed, as a fraction of the
-elapsed time, for arrivals, counter and ticks."""
+"""Fraction of the elapsed time that is added to the tolerance of the first device time after the
+port was closed, for arrivals, counter and ticks."""
 _SKEW_CHECK_SAMPLES = 256
 """Number of samples between two plausibility checks of the skew."""
 
@@ -131,8 +131,9 @@ class DeviceClock:
     def state(self) -> str:
         """Source of the timestamps.
 
-        ``settling``, ``direct``, ``echo``, ``passive``, ``arrival`` (no device time) or ``stale``
-        (echoes stopped).
+        The values are ``settling`` (no settled estimate yet), ``direct`` (sync edges, or a clock
+        declared to be the host clock), ``echo`` (echoes), ``passive`` (device time and arrivals),
+        ``arrival`` (arrivals without device time) and ``stale`` (echoes that stopped).
         """
         if not self._synced:
             return "settling"
@@ -333,7 +334,7 @@ class DeviceClock:
     ) -> DeviceTime | None:
         """Return the reader of the best available device time.
 
-        Return None if this sample lacks the device time that the samples before contained.
+        Return None if this sample lacks the device time that earlier samples contained.
         """
         if ticks is not None and tick_clock is not None:
             self._absent = 0

@@ -93,7 +93,7 @@ def _has_backlog_ended(
     if ahead_ns <= _BACKLOG_NS:
         return False
 
-    if echo is not None and echo.settled:  # the minimum-delay filter is then not fed
+    if echo is not None and echo.settled:  # the minimum-delay filter then gets no samples
         return arrival_ns - echo.host_ns(u) >= -_BACKLOG_NS
     return envelope.settled and envelope.residual(u, arrival_ns - u) >= -_BACKLOG_NS
 

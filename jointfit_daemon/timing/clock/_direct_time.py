@@ -6,8 +6,9 @@ the direct time, the direct time is discarded and a warning is published.
 
 A sync edge is one instant with two timestamps: u on the device clock, v on the reference clock. The
 line ``v(u)`` through the edges of the last minute relates the two clocks with an accuracy of
-microseconds. The conversion of v to host time then also applies to u. The error of this conversion,
-including the minimum delay, is common to both clocks and cancels in time differences.
+microseconds. The line converts u to v, and the reference clock converts v to host time. The error
+of the reference clock, including its minimum delay, is then common to both clocks, and cancels in
+differences between their host times.
 """
 
 from __future__ import annotations

@@ -2,10 +2,11 @@
 
 An echo is sent at host time a, answered with server time u, and received at host time b. The clock
 offset is ``theta = u - (a + b)/2``, with an error of at most half the round-trip time ``rho = b -
-a``. Over the host time m, the line ``theta(m) = theta_0 + s (m - m_0)`` is fitted to the echoes
-with round-trip times near the minimum. The method is weighted least squares with Huber weights. A
-prior on the skew s keeps s small in the first seconds. The error of theta_0 is half the difference
-between the delays of request and reply; ``bound_ns`` is the limit of this error.
+a``. The line ``theta(m) = theta_0 + s (m - m_0)`` is fitted to the echoes with round-trip times
+near the minimum. m is the host time, m_0 the mean host time of these echoes, and s the skew. The
+method is weighted least squares with Huber weights. A prior on the skew s keeps s small in the
+first seconds. The error of theta_0 is half the difference between the delays of request and reply;
+``bound_ns`` is the limit of this error.
 
 Invariant: a single wrong or forged echo does not change a settled fit. An echo that contradicts the
 fit is not used. If the next echo agrees with this echo, the server clock was restarted.

@@ -1,13 +1,12 @@
 """Line below a set of points with one-sided errors: posterior mean and covariance.
 
-For points ``y = c + s u + D`` with delays D >= 0, a line (c, s) is *feasible* if it lies above no
-point. Near the minimum delay the points have a constant density G per nanosecond of height,
-for every shape of the delay distribution. The likelihood of a feasible line is then ``exp(G
-sum_mean)`` with ``sum_mean = c + s mean(u)``. The maximum of the likelihood is the edge of the
-lower convex hull that straddles the mean of u (Moon, Skelly, Towsley, INFOCOM 1999; Zhang, Liu,
-Xia, INFOCOM 2002).
+For points ``y = c + s u + D`` with delays D >= 0, a line (c, s) is *feasible* if no point lies
+below it. Just above the line of the minimum delay, the number G of points per nanosecond of height
+is constant, for every shape of the delay distribution. The likelihood of a feasible line is then
+``exp(G (c + s mean(u)))``. The maximum of the likelihood is the edge of the lower convex hull that
+straddles the mean of u (Moon, Skelly, Towsley, INFOCOM 1999; Zhang, Liu, Xia, INFOCOM 2002).
 
-The posterior mean under a normal prior on s has a smaller error than the maximum. It also has a
+The posterior mean under a normal prior on s has a smaller error than the maximum, and it has a
 covariance. For a given s, the largest feasible c is ``h(s) = min(y - s u)``. Below this value c is
 distributed exponentially, with mean ``h(s) - 1/G``. The integral over s is evaluated numerically.
 

@@ -1,9 +1,10 @@
 """Minimum-delay filter, which relates device clock and host clock from arrival times alone.
 
-With device time u and arrival A, the difference ``y = A - u = c + s u + D`` contains a delay ``D >=
-D_min`` of unknown distribution. The filter fits the line below all points (``mean_feasible_line``).
-This line depends on the fastest samples only. Jitter of any distribution therefore causes no bias
-other than the constant D_min, which one-way measurements cannot observe.
+A sample with the device time u and the arrival A has the difference ``y = A - u = c + s u + D``. c
+is the clock offset, s the skew, and ``D >= D_min`` a delay of unknown distribution. The filter fits
+the line below all points (``mean_feasible_line``). This line depends on the fastest samples only.
+Jitter of any distribution therefore causes no bias other than the constant D_min, which one-way
+measurements cannot observe.
 
 Inputs are integers. Memory is constant, and so is the time per sample, except for the periodic
 refit.

@@ -1,8 +1,8 @@
 """Host timestamps of one device, monotonic and slewed toward the clock estimate.
 
 Invariants: timestamps never decrease in the order of device time. Once the clock is synced, a
-timestamp approaches its estimate by at most 500 ppm of the elapsed time. An error too large for
-this is a step, which is returned to the caller.
+timestamp approaches its estimate by at most 500 ppm of the elapsed time. An error too large to be
+slewed is a step, and is returned to the caller.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class MonotonicStamps:
         """Device time of the last sample in order, ns; None after a restart."""
         self.last_t: int | None = None
         """Last timestamp, ns. A restart does not reset it, so that timestamps never decrease."""
-        self._newest: int | None = None  # last timestamp, also without device time
+        self._newest: int | None = None  # last timestamp, with or without device time
 
     @property
     def offset_ns(self) -> int | None:

@@ -1,9 +1,9 @@
 """Matching of the sync edges of a device to the instants of the reference clock.
 
-All devices on a sync line assign timestamps to the same physical edges. The clock estimates from
-arrivals convert these timestamps to host time with an error of a few milliseconds. Two timestamps
-therefore belong to the same edge if the difference of their host times is small compared with the
-interval between edges.
+A sync line is a wire on which all connected devices timestamp the same pulse edges. The clock
+estimates from arrivals convert these timestamps to host time with an error of a few milliseconds.
+Two timestamps therefore belong to the same edge if the difference of their host times is small
+compared with the interval between edges.
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ from bisect import bisect_left
 from typing import NamedTuple
 
 UNAMBIGUOUS = 0.35
-"""Largest distance of two estimates of one edge, as a fraction of the interval between edges."""
+"""Largest difference between two estimates of the time of one edge, as a fraction of the interval
+between edges."""
 FARTHEST_NS = 20_000_000
-"""Largest distance of two estimates of one edge, ns."""
+"""Largest difference between two estimates of the time of one edge, ns."""
 _INSTANTS = 512
 """Largest number of reference instants in memory. Above this number, the older half is
 dropped.

@@ -260,7 +260,7 @@ def coarse_lags(
     if not np.isin(tied, inside).any():
         return (), (
             f"no common motion within {settings.span_s:g} s: check that the sensor sits on this "
-            "body and that both clocks are mapped"
+            "body and that both clocks are converted to host time"
         )
 
     tied = tied[np.argsort(np.abs(tied - reach), kind="stable")]

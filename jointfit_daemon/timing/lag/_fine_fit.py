@@ -181,7 +181,7 @@ def _linearize(
 
 
 def _norms(vectors: Floats) -> Floats:
-    x, y, z = vectors.T  # faster by columns than as a sum over an axis of three elements
+    x, y, z = vectors.T  # columns are faster than a sum over an axis of three elements
     norms: Floats = np.sqrt(x * x + y * y + z * z)
     return norms
 
@@ -206,8 +206,9 @@ def _huber_weights(norm: Floats, clip: float) -> Floats:
 def _best_clip(linear: LinearizedLag) -> float:
     r"""Return the threshold, rad/s, with the least variance :math:`\sum h\psi^2 / (\sum h\psi')^2`.
 
-    h is the information of a row about the lag, and psi the derivative of the Huber loss.
-    Correlations between residuals are neglected, because they are the same for all thresholds.
+    h is the information about the lag in one compared rate, and psi the derivative of the Huber
+    loss. Correlations between residuals are neglected, because they are the same for all
+    thresholds.
     """
     norm = _norms(linear.residual)
     scale = _scale(norm)

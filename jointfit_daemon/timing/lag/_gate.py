@@ -1,7 +1,8 @@
 """Gate of the lag: the conditions under which the lag of a window is accepted.
 
 A window that fails a condition is refused. The reason names the finding, the threshold and the
-remedy, and appears in ``tracked_refused`` and ``quality.lag.ID.refused``. The conditions, in order:
+remedy. It is published under the MQTT keys ``tracked_refused`` and ``quality.lag.ID.refused``. The
+conditions, in order:
 
 1. The markers move enough: rate and acceleration (`motion_fault`).
 2. The search finds a common motion of sensor and markers (``_estimate.coarse_lags``).
@@ -39,7 +40,7 @@ class LagSettings:
     """
 
     span_s: float = 0.15
-    """Largest lag in the search, s; use 3 s if a clock is not mapped to host time."""
+    """Largest lag in the search, s; use 3 s if a clock is not converted to host time."""
     step_s: float = 0.004
     """Step of the search, s."""
     cutoff_hz: float = 10.0
@@ -56,7 +57,7 @@ class LagSettings:
     """Least RMS angular acceleration of the reference, rad/s²."""
     max_sigma_ns: float = 700_000.0
     """Largest standard deviation, ns. Ordinary motion determines the lag with a much smaller
-    standard deviation, so windows are not selected by chance.
+    standard deviation. Random errors therefore do not decide whether its windows are accepted.
     """
     min_r2: float = 0.98
     """Least R². Correct data on one rigid body reach 0.998; sensors on soft tissue reach less."""
@@ -64,7 +65,7 @@ class LagSettings:
         "different motions or a wrong convention; check that the sensor is on this body and "
         "attached firmly"
     )
-    """Likely cause of a smaller R², and its remedy."""
+    """Likely cause of an R² below `min_r2`, and its remedy."""
     min_weight: float = 0.7
     """Least mean Huber weight. Below this value the fit depends on a minority of the data."""
     min_valid: float = 0.8
@@ -122,7 +123,7 @@ def fit_fault(
         (
             abs(fit.tau_s) <= settings.span_s,
             f"{1e3 * fit.tau_s:.0f} ms is outside the searched span of {1e3 * settings.span_s:.0f} "
-            "ms: check that both clocks are mapped",
+            "ms: check that both clocks are converted to host time",
         ),
     )
     failed = next((reason for passed, reason in conditions if not passed), None)

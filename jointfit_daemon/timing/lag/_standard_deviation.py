@@ -15,14 +15,14 @@ A variance from few blocks is uncertain itself. :math:`\nu + 1 = (\sum h)^2/\sum
 effective number of blocks that carry the information h about the lag. The standard deviation of the
 finest scale is multiplied by the ratio of the Student t quantile with :math:`\nu` degrees of
 freedom to the normal quantile of equal probability. The other scales only detect long correlations,
-and are not corrected. If the window contains a single tap and otherwise rest, the result is
-infinite.
+and are not corrected. If the window contains a single short movement and otherwise rest, the result
+is infinite.
 
 If all samples with information about the lag have the same timestamp error, the residuals do not
 show this error. Devices sample on ticks of an internal clock. The rounding error of the timestamps
 is a sawtooth: the error drifts through one tick and jumps back. The mean error over time is part of
-the lag, but a short passage of fast motion contains only a part of the sawtooth. For a random phase
-the variance is
+the lag, but a short passage of fast motion contains only a part of the sawtooth. If the phase of
+the sawtooth is random, its contribution to the variance of the lag is
 
 .. math:: \sigma_s^2 G, \quad G = \frac{6}{\pi^2} \sum_{k=1}^{3} \frac{|H(k/P)|^2}{k^2}, \quad
           H(f) = \frac{\sum h_j e^{2\pi i f t_j}}{\sum h_j},
@@ -47,8 +47,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.lag._angular_rates import Floats
 
 RIDGE = 1e-9
-"""Relative ridge on the rotation. Motion about one axis does not determine the rotation about that
-axis.
+"""Ridge (regularization) of the rotation, relative to its information. Motion about one axis does
+not determine the rotation about that axis.
 """
 LEAST_BLOCKS = 5
 """Least number of blocks."""
@@ -61,9 +61,10 @@ SIGMAS = 2.8
 STAMP_PERIODS_S = (1.95, 3.9)
 """Periods of the sawtooth error of the timestamps, s; the larger variance is used.
 
-The period is the tick divided by the relative skew. In the recordings of the experiment
-``lag-all-trials``, 0.5 ms divided by 257 ppm is 1.95 s. The second period belongs to half this
-skew. A slower sawtooth is nearly constant in most windows, and is then part of their lag.
+The period is the tick divided by the relative skew. The recordings of the benchmark experiment
+``lag-all-trials`` (docs/accuracy/timing.md) have a tick of 0.5 ms and a skew of 257 ppm, hence a
+period of 1.95 s. The second period belongs to half this skew. A slower sawtooth is nearly constant
+in most windows, and is then part of their lag.
 """
 _HARMONICS = np.arange(1, 4)
 """Numbers of the harmonics of the sawtooth that are used; they contain 83 % of its power."""
@@ -93,7 +94,7 @@ class LinearizedLag(NamedTuple):
 
 
 def lag_sigma(solved: LinearizedLag, memory_s: float, stamp_sd_s: float = 0.0) -> float:
-    """Return the standard deviation of the lag, s; infinite if too few rows determine it.
+    """Return the standard deviation of the lag, s; infinite if too few rates determine the lag.
 
     Parameters
     ----------

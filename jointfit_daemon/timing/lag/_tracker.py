@@ -1,8 +1,8 @@
 r"""Running lag estimate from many windows, with detection of steps.
 
 A Kalman filter estimates the lag and its drift, :math:`(\tau, \dot\tau)`, with one update per
-window. If both clocks are mapped to host time, the lag is nearly constant, so the filter assumes a
-small drift. A step indicates that a device restarted or changed a filter.
+window. If both clocks are converted to host time, the lag is nearly constant, so the filter assumes
+a small drift. A step indicates that a device restarted or changed a filter.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 DRIFT_NOISE = 0.02e-6
 """Standard deviation of the random walk of the drift per square root of the time, 1/sqrt(s)."""
 DRIFT_SD = 5e-6
-"""Prior standard deviation of the drift of two mapped clocks, dimensionless."""
+"""Prior standard deviation of the drift between two clocks that are converted to host time,
+dimensionless."""
 GATE_SIGMAS = 4.0
 """Innovation, in standard deviations, above which a window may be the beginning of a step.
 `LagSettings` contains the thresholds for a single window.
