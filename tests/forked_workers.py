@@ -37,11 +37,11 @@ CHECK_S = 1.0
 WORKERS_THAT_WAIT = 2
 """Number of workers that begin with real-time tests, which wait for half of their time."""
 FIT_NICE = 10
-"""Nice value of a worker whose tests compute, as for a fit.
+"""Nice value of a worker whose tests compute. It equals the nice value of a fit of the daemon.
 
-Daemons and devices in real time thus have a higher priority, and their fits do not wait for all
-other tests. A process cannot raise its priority again, so another worker starts after the last of
-these tests.
+Therefore daemons and devices in real time have a higher priority than these tests, and a fit of a
+daemon has the same priority. A process cannot raise its priority again, so another worker starts
+after the last of these tests.
 """
 
 

@@ -57,7 +57,7 @@ def messages(text: str) -> str:
 
 @cache
 def _strings(text: str) -> tuple[list[str], list[str]]:
-    """Return the strings of a Python module that are statements of their own, and the others."""
+    """Return the docstrings of a Python module, also of attributes, and all other strings."""
     nodes = list(ast.walk(ast.parse(text)))
     alone = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
     found: tuple[list[str], list[str]] = ([], [])

@@ -12,7 +12,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 LARGEST_DEG = 4.0
-"""Largest accepted difference, RMS. OpenSim's knee has one axis, the knee of the fusion has three.
+"""Largest accepted RMS difference between the joint angles of the fusion and of OpenSim, deg.
+OpenSim's knee has one axis, the knee of the fusion has three.
 """
 
 

@@ -37,7 +37,8 @@ def test_predicted_error_of_a_recorded_joint_center_is_not_much_too_small(tmp_pa
     for joint in joints:
         stated = figures[f"{joint}: stated error"]
         stated_across = figures[f"{joint}: stated error across the axis"]
-        # the center of the model moves by 4 to 18 mm relative to the markers
+        # the reference, the joint center of the scaled model, moves by 4 to 18 mm relative to the
+        # markers
         across = figures[f"{joint}: distance to the model across the axis"]
         assert across < 2.0 * stated_across + 18.0
         assert figures[f"{joint}: distance to the model"] < 2.0 * stated + 18.0

@@ -13,12 +13,13 @@ from bench.framework.material import SEEDED
 EXPERIMENTS = {experiment.id: experiment for experiment in find_experiments()}
 SHORT = [e for e in EXPERIMENTS.values() if not e.long and e.topic not in {"speed", "joint_center"}]
 SEVERAL = re.compile(r"[0-9]+ simulated (subjects|sensors)|(five|eight) assignments")
-"""Material of several subjects, or of several assignments of filter errors to sensors."""
+"""Pattern of descriptions of data sets with several simulated subjects or sensors, or with several
+assignments of filter errors to sensors."""
 COUNTED = {
     "healthy-sensors-simulated", "healthy-sensors-after-squats", "healthy-sensors-after-walking",
     "online-learning-wrong-cameras",
 }  # fmt: skip
-"""Experiments that count events over all subjects."""
+"""Experiments that count events over all subjects. Their tables have no median over subjects."""
 WORDS = re.compile(r"[a-z]+[0-9]*(-[a-z]+)+")  # names of devices end with digits
 
 
@@ -62,6 +63,7 @@ def test_committed_results_describe_their_experiment(experiment: Experiment) -> 
     ids=lambda e: e.id,
 )
 def test_table_of_several_subjects_or_deals_has_median_and_extreme(experiment: Experiment) -> None:
+    """A deal is one assignment of filter errors to sensors."""
     results = storage.results_of(storage.load(experiment.id))
     text = " ".join([experiment.title, *(f"{r.name} {r.note}" for r in results)])
     assert "median" in text

@@ -8,7 +8,8 @@ from bench.experiments.timing.memory import Held, growth, held, watch
 
 KIB = 1024
 FULL_H = 0.06
-"""Time after which windows of a minute and echoes of two minutes are full, h."""
+"""Time after which two buffers of the timing are full, h: the arrivals of the last minute, and the
+clock echoes (request and answer of the camera server) of the last two minutes."""
 
 
 @pytest.mark.experiment

@@ -53,6 +53,7 @@ def test_trace_contains_the_lag_that_clocks_cannot_estimate() -> None:
 
 @pytest.mark.experiment
 def test_trace_contains_both_incidents() -> None:
+    """The incidents of the simulated run are a reboot of S3 and half a second of silence of S2."""
     run, trace = watched()
     gone_s = run.incidents["S3 reboots"]
     after = [row.synced for row in trace.stamps["S3"] if row.arrival_ns > _at(trace, gone_s + 1)]

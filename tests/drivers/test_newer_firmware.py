@@ -196,6 +196,7 @@ def test_newer_messages_of_the_other_servers_are_named() -> None:
 
 
 def test_corrupt_messages_that_pass_a_checksum_are_not_reported() -> None:
+    """An unknown message is reported only if it arrives often."""
     newer = NewerFirmwareDetector(NewestKnown((1,), "MT Manager"))
     assert not [
         event for k in range(100) for event in newer.take_unknown(f"message {k % 16}", k * 20 * S)

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 TICK_NS = 100_000
 PERIOD_NS = 10_000_000
-APART_NS = 20_000  # between messages that were buffered
-BEFORE = 40  # messages before the stall
+APART_NS = 20_000  # time between the arrivals of messages that were buffered
+BEFORE = 40  # number of messages before the stall
 
 
 class Received(NamedTuple):
@@ -79,7 +79,10 @@ def paused_sender(
 def stalled_receiver(
     start: tuple[int, int], stall_ms: int, kept: int, resets_counter: int = 0
 ) -> list[Received]:
-    """Return the messages at a receiver that pauses; its buffer holds `kept` messages."""
+    """Return the messages at a receiver that pauses; its buffer holds `kept` messages.
+
+    After the pause, the counter is lower by `resets_counter` than without the pause.
+    """
     missed = stall_ms * 1_000_000 // PERIOD_NS
     resumed_ns = (BEFORE + missed) * PERIOD_NS
     stream: list[Received] = []
@@ -132,7 +135,8 @@ def test_a_backlog_of_a_stalled_receiver_is_a_delay_and_no_restart(
     uncounted: bool,
 ) -> None:
     missed = stall_ms * 1_000_000 // PERIOD_NS
-    resets = max(missed - kept, 0) if uncounted else 0  # the counter pauses while messages are lost
+    # The counter of some devices does not count the lost messages.
+    resets = max(missed - kept, 0) if uncounted else 0
     if resets and missed < 25:
         return
     assert restarts(stalled_receiver(start, stall_ms, kept, resets)) == 0

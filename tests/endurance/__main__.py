@@ -96,7 +96,7 @@ def process_values(pid: int, counts: Path) -> dict[str, float]:
 
 
 def daemon_values(listener: Listener, movement: Movement, unix_ns: int) -> dict[str, float]:
-    """Return the values in the messages of an interval."""
+    """Return the values that the messages of the daemon contain since the last measurement."""
     health = listener.latest["bridge/health"]
     errors = sorted(
         error
@@ -153,8 +153,8 @@ def variant_of(child: ChildProcess) -> str:
 def write_rig(folder: Path, port: int, factor: int) -> None:
     """Write rig.toml and a calibration of its chain."""
     text = RIG.format(port=port, base=BASE, folder=folder, health_s=5)
-    # The limit `silence_s` is one second of real time, because this machine pauses processes for
-    # tenths of a second.
+    # The limit `silence_s` is one second of real time, because a loaded machine pauses processes
+    # for tenths of a second.
     line = {"folder": folder, "rate_hz": RATE_HZ, "silence_s": factor}
     text += "".join(IMU.format(name=name, **line) for name in SENSORS)
     (folder / "rig.toml").write_text(text, "utf-8")
@@ -236,7 +236,7 @@ def counters_of(listener: Listener) -> dict[str, int]:
 def results_of(
     found: list[dict[str, float]], counters: dict[str, int], variant: str, factor: int
 ) -> dict[str, Any]:
-    """Return the slopes of a run, for the page."""
+    """Return the slopes and counters of a run, which are stored for docs/reliability.md."""
     samples = [row["samples"] for row in found]
     names = [name for name in found[0] if name != "samples"]
     slopes = {name: slope_of(samples, [row[name] for row in found], len(names)) for name in names}

@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 RESULTS = Path(__file__).parent / "results.json"
 ERROR = "median error of poses, deg"
 MOST_ERROR_DEG = 3.0
-"""Largest median pose error of an interval, deg. It includes the movement during the wait of a
-sample for the rest of its batch."""
+"""Largest accepted median pose error of an interval, deg. The error includes the movement of the
+sensors while a sample waits for the other samples of its batch."""
 MOST_MISSING = 0.01
-"""Largest share of samples that are lost or dropped. A larger share shows that the daemon is too
-slow for the factor, so the run has not tested normal operation."""
+"""Largest accepted share of samples that are lost or dropped. A larger share shows that the daemon
+is too slow for the factor, so the run has not tested normal operation."""
 LEAST_SAMPLES = 10_000_000
 """Number of samples below which buffers are still filling, so that slopes prove nothing."""
 BLOCKS = 12

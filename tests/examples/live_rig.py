@@ -1,4 +1,4 @@
-"""Replacement for the daemon, which publishes a pose with the daemon's encoders at 10 Hz."""
+"""Replacement for the daemon: it publishes a fixed pose at 10 Hz with the daemon's encoders."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SHOWN = "knee flexion 28.31° ± 1.4°"
 async def live_rig(
     port: int, version: Literal["5", "3.1.1"] = "5"
 ) -> AsyncIterator[MqttConnection]:
-    """Publish `STATE` on ``pose/ui`` and ``joint/knee`` during the block; yield the connection.
+    """Publish `STATE`, a limb state, on ``pose/ui`` and ``joint/knee``; yield the connection.
 
     The embedded broker connects publishers and subscribers of the same MQTT version only.
     """

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "fleet"
 BASE = "jointfit/wearer-01"
 LINKED_S = 15.0
-"""Time limit for the bridge to connect, s; `restart_timeout` is 10 s at the most."""
+"""Time limit for the connection of the bridge, s. It is longer than its `restart_timeout`, 10 s."""
 
 pytestmark = pytest.mark.skipif(
     MosquittoBroker.missing() is not None, reason=MosquittoBroker.missing() or ""

@@ -37,7 +37,7 @@ INFLUX = re.compile(
 
 
 def exposed() -> dict[str, set[str]]:
-    """Return the labels of every sample that the daemon can expose, by name."""
+    """Return the labels of every metric that the daemon can expose, by name of the metric."""
     found: dict[str, set[str]] = defaultdict(set)
     frames = FrameStatistics()
     frames.calibrated_s = 1.0

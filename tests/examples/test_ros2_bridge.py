@@ -1,7 +1,8 @@
 """The ROS 2 bridge: conventions against SciPy, messages against the definitions of ROS 2.
 
-ROS 2 is not installed here. The oracle of the messages is the type store of `rosbags`, which has
-the definitions of ROS 2 and serialises to CDR. The node of `rclpy` is a stand-in.
+The tests run without ROS 2. The messages are checked with the type store of the package `rosbags`,
+which contains the definitions of ROS 2 and converts messages to CDR, the wire format of ROS 2. A
+stand-in replaces the node of `rclpy`.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ def bridge_module(name: str) -> Any:
 
 
 def joint_state_of_store(**fields: Any) -> Any:
-    """Return the message with arrays of NumPy, which the type store expects instead of array."""
+    """Return the message with NumPy arrays; the type store does not accept `array.array`."""
     arrays = {key: np.asarray(fields.pop(key)) for key in ("position", "velocity", "effort")}
     return STORE.types["sensor_msgs/msg/JointState"](**fields, **arrays)
 

@@ -1,7 +1,8 @@
 """A TCP proxy between the daemon and the broker, which is slow or simulates lost segments.
 
-The proxy is used because not every kernel has netem. TCP repairs a lost segment after a pause, and
-the proxy makes this pause. The connections of other clients have no fault.
+The proxy is used because not every kernel has netem, the network emulator of Linux. TCP sends a
+lost segment again after a pause, and the proxy makes this pause. The connections of other clients
+have no fault.
 """
 
 from __future__ import annotations

@@ -245,7 +245,7 @@ class Gateway:
         return answer
 
     async def start_fit(self) -> set[int]:
-        """Start a static phase at rest; return the processes of its fit when they run."""
+        """Start a static phase at rest, and wait until its fit runs; return the process ids."""
         self.rest(resting=True)
         await asyncio.sleep(0.5)
         answer = await self.request("calibrate", phase="static", seconds=2.0, force=True)
@@ -382,7 +382,10 @@ class Gateway:
         return await self.seconds(lambda: self.listener.find_event(device, *parts))
 
     async def health(self) -> dict[str, Any]:
-        """Return the second health message from now; all its values are current."""
+        """Return the second health message from now.
+
+        The first one may contain values from before the call.
+        """
         count = self.listener.healths
         await self.listener.until(lambda: self.listener.healths > count + 1)
         found: dict[str, Any] = self.listener.latest["bridge/health"]

@@ -1,4 +1,4 @@
-"""The table of the daemon and other programs under the same faults on docs/reliability.md."""
+"""The table on docs/reliability.md that compares the daemon with other programs."""
 
 from __future__ import annotations
 

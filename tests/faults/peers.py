@@ -92,7 +92,10 @@ async def publishers(port: int) -> AsyncIterator[dict[str, asyncio.subprocess.Pr
 
 
 async def meet_broker_faults(gateway: Gateway, repeat: int, found: Figures) -> None:
-    """Kill the broker for one to two seconds, `repeat` times; then freeze it until all notice."""
+    """Kill the broker for one to two seconds, `repeat` times; then freeze it.
+
+    The broker is frozen until the daemon and all publishers have detected the loss.
+    """
     topics = {name: f"peer/{number}" for number, name in enumerate(PAUSES_S)}
     port = gateway.broker.port
     times = MessageTimes(port, topics | {DAEMON: f"{BASE}/pose"})
@@ -102,7 +105,8 @@ async def meet_broker_faults(gateway: Gateway, repeat: int, found: Figures) -> N
             await times.recovered(20.0)
             for _ in range(repeat):
                 gateway.broker.stop()
-                await asyncio.sleep(OUTAGE_S + random.random())  # at a random phase of the pauses
+                # With a random duration, the outage ends at any instant of a publisher's pause.
+                await asyncio.sleep(OUTAGE_S + random.random())
                 gateway.broker.start()
                 for name, value_s in (await times.recovered(30.0)).items():
                     found["publishing after the broker returned"][name].append(value_s)

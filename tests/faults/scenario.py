@@ -28,7 +28,8 @@ class Outcome:
     noticed_s: float
     """Time from the fault to its report, s."""
     recovered_s: float
-    """Time from the end of the fault to the first pose that is as before the fault, s."""
+    """Time from the end of the fault until the disturbed function works as before, s. In most
+    scenarios, this is the time until a pose with all sensors."""
     pose_gap_s: float
     """Longest time between two poses during the run, s."""
     lost: int

@@ -3,8 +3,9 @@
 Each target runs in two processes, one after the other. The first process is guided by coverage
 (atheris, libFuzzer). It stores the inputs that reach new code in build/fuzz/corpus/TARGET, and the
 next run begins with these inputs. The second process changes these inputs at random without
-coverage, which is about five times faster. A finding is stored under build/fuzz/TARGET/, and
-fuzzing continues. The exit code is 1 if there was a finding.
+coverage, which is about five times faster. A finding is an input that causes an undocumented
+exception, or exceeds a limit of time or memory. It is stored under build/fuzz/TARGET/, and fuzzing
+continues. The exit code is 1 if there was a finding.
 
 The instrumentation of the modules takes ten seconds, longer than a short run of a target. Each job
 therefore has one process that imports all modules, and the guided processes are its forks.
@@ -45,7 +46,7 @@ MOST_FINDINGS = 20
 NOT_INSTALLED = 3
 GUIDED, MUTATED = "guided", "mutated"
 GUIDED_PART = 0.2
-"""Share of the cases of a target that coverage guides; they need half of the time."""
+"""Share of the cases of a target that coverage guides. They may take half of the time."""
 ENVIRONMENT = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
 _DAY_S = 86_400.0
 _EXTRA_S = 60

@@ -81,7 +81,7 @@ def folder() -> Path:
 
 @cache
 def guards() -> tuple[RequestAuthenticator | None, ...]:
-    """Return the two cases of authentication: None without a key, and an authenticator."""
+    """Return None for a rig without a request key, and the authenticator of a rig with a key."""
     key_file = folder() / "request.key"
     key_file.write_bytes(KEY)
     key_file.chmod(0o600)
@@ -171,7 +171,7 @@ def _good_content() -> str:
 
 
 def use_calibration(calibration: Calibration) -> None:
-    """Run the core with a calibration that was accepted, with samples of every sensor."""
+    """Run the core with this calibration and with samples of every sensor."""
     core, reporter = Core(), TopicWriter(rig(), Outbox("b/bridge/state"), UnixClock())
     events: list[Event] = [Configured(BEGIN_NS, rig(), calibration, 1)]
     events += [SourceOpened(BEGIN_NS, name) for name in SENSORS]
@@ -242,7 +242,7 @@ def run_recording(data: bytes) -> None:
 
 
 def seeds_recording() -> list[bytes]:
-    """Return events of every kind."""
+    """Return a recording of a configuration, an opened source, a chunk and a tick."""
     events: list[Event] = [
         Configured(BEGIN_NS, parse_rig(table()), good_calibration(), 1),
         SourceOpened(BEGIN_NS, "S1"),

@@ -70,7 +70,7 @@ def count(chunks: Iterable[Chunk]) -> int:
 
 
 def read_captures(path: Path) -> None:
-    """Read a file as a capture of every wire."""
+    """Read a file as a capture of a stream, of datagrams and of CAN frames."""
     for wire in ("stream", "datagram", "can"):
         try:
             for _ in read_capture(path, wire):

@@ -70,7 +70,7 @@ def run_table_bytes(data: bytes) -> None:
 
 
 def run_table_frames(data: bytes) -> None:
-    """Decode CAN frames of records ``u8 identifier, u8 size, data`` with two tables."""
+    """Decode CAN frames of records ``u8 identifier, u8 size, data`` with three tables."""
     for settings, driver in can_tables():
         decoder, keys = driver.decoder(), settings.keys()
         for number, (kind, content) in enumerate(records(data)):

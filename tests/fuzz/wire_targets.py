@@ -432,7 +432,7 @@ def seeds_natnet_core() -> list[bytes]:
 
 
 def run_qtm_stream(data: bytes) -> None:
-    """Split a stream of QTM in packets; every byte belongs to a packet or is counted."""
+    """Split a stream of QTM into packets; every byte belongs to a packet or is counted."""
     stream = qtm.QtmStream()
     found: list[bytes | CorruptBytes] = []
     for piece in cut(data):

@@ -1,8 +1,9 @@
 """``make load``: the daemon at the full rate of its inputs; every sample must have an outcome.
 
-Four IMUs fill serial lines of 921 600 baud. A sensor and foreign frames fill a CAN bus. Cameras
-send 60 markers at 300 Hz. The inputs pause and are counted, send for the given time, pause and are
-counted again. The command returns 1 if a sample was not received, was dropped or has no outcome.
+Four IMUs fill serial lines of 921 600 baud. A sensor and the frames of other devices fill a CAN
+bus. Cameras send 60 markers at 300 Hz. The samples are counted during a pause before and a pause
+after the given time of sending. The command returns 1 if a sample was not received, was lost,
+corrupt or dropped, or has no outcome.
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ RATES_HZ = dict.fromkeys(SERIAL, 400) | {"S5": 100, "mocap": 300}
 BITRATE = 500_000
 STRANGER = CanFrame(0, 0x123, bytes(8))
 STRANGERS_HZ = BITRATE // frame_bits(8, extended=False) - 4 * RATES_HZ["S5"]
-"""Number of foreign frames per second that fill the bus, in addition to four frames per sample."""
+"""Number of frames of other devices, frames/s, that fill the bus together with the four frames of
+each sample."""
 MARKERS = tuple(f"M{number}" for number in range(60))
 SETTLE_S = 2.0
 """Pause of the inputs before they are counted, s."""
@@ -95,7 +97,7 @@ silence_s = 30
 
 
 Sources: TypeAlias = "tuple[tuple[int, Callable[[float], object]], ...]"
-"""Rate of each source, Hz, and the function that sends its sample at a time, s."""
+"""Rate of each source, Hz, and the function that sends the sample of a given time, s."""
 
 
 class Inputs:
@@ -144,10 +146,9 @@ class Inputs:
             tasks.create_task(self._send(sources))
 
     async def _send(self, sources: Sources) -> None:
-        """Send at the rates of the sources; the devices also sample while this process pauses.
+        """Send at the rates of the sources; after a pause of this process, send all due samples.
 
-        Samples and frames are sent in the order of their times, as on a bus, even if many are due
-        after a pause of this process.
+        Samples and frames are sent in the order of their times, as on a bus.
         """
         numbers = [0] * len(sources)
         while True:

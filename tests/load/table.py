@@ -8,8 +8,8 @@ from typing import Any
 RESULTS = Path(__file__).parent / "results.json"
 COUNTERS = ("lost", "corrupt", "dropped", "late")
 SMALLEST_SHARE = 0.98
-"""Smallest ratio of sent samples to rate times duration. With a smaller ratio, the load was too
-low."""
+"""Smallest accepted ratio of the number of sent samples to the product of rate and duration. With a
+smaller ratio, the load was too low."""
 
 
 def table_of(results: dict[str, Any]) -> str:
@@ -27,7 +27,10 @@ def table_of(results: dict[str, Any]) -> str:
 
 
 def faults_of(results: dict[str, Any]) -> list[str]:
-    """Return the inputs with samples that were not sent, not received, or have no outcome."""
+    """Return the inputs with a sample that was not sent, not received, lost, corrupt or dropped.
+
+    Inputs with a sample without an outcome are also returned.
+    """
     return [
         f"{name}: {found}"
         for name, found in results["inputs"].items()

@@ -1,4 +1,7 @@
-"""``make mutation``: measures the share of random mutants that the tests of a package detect."""
+"""``make mutation``: measures the share of random mutants that the tests of a package detect.
+
+A mutant is the code with one small change, such as another operator.
+"""
 
 from __future__ import annotations
 
@@ -46,10 +49,12 @@ OPTIONS += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
 unchanged source.
 """
 CPU_FACTOR, CPU_S = 15, 5
-"""Limit of the processor time of the tests of a mutant: a multiple of the time without mutant, plus
-seconds. The time without mutant is measured with a tenth of the inputs of property tests.
+"""Limit of the processor time of the tests of a mutant: `CPU_FACTOR` times the time without mutant,
+plus `CPU_S` seconds. The time without a mutant is measured with a tenth of the inputs of property
+tests.
 
-A mutant that needs more time is killed, because it contains an endless loop.
+The tests of a mutant that need more time are stopped, and the mutant counts as detected, because it
+probably contains an endless loop.
 """
 WALL_S = 7200.0
 """Time limit for tests that wait without end, s."""
@@ -270,7 +275,7 @@ def _wait(child: int) -> int:
 
 
 def _replace(path: Path, source: str) -> None:
-    """Let the import of a file use another source."""
+    """Make the import of a file execute `source` instead of the content of the file."""
     original = importlib.machinery.SourceFileLoader.get_code
 
     def get_code(self: importlib.machinery.SourceFileLoader, fullname: str) -> CodeType | None:

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 IMPORT = ""
 """Context of lines that are executed while pytest imports the tests."""
 SHARED_STATE = re.compile(r"^@cache\b|scope=", re.MULTILINE)
-"""Pattern of files with cached results or shared fixtures. There, a test depends on lines that only
-an earlier test executed."""
+"""Pattern of test files with cached results or shared fixtures. In such a file, a test may depend
+on lines that only an earlier test executed."""
 
 
 class ExecutionRecorder:

@@ -96,7 +96,7 @@ def test_maintainer_scripts_are_sound_shell_and_guard_systemd(name: str) -> None
 
 
 def test_the_configuration_is_no_conffile_of_dpkg() -> None:
-    # Users change every rig, and dpkg would ask about a changed conffile at every upgrade.
+    # Every user changes the rig. For a changed conffile, dpkg would ask questions at every upgrade.
     assert not (DEBIAN / "conffiles").exists()
     assert "! -e /etc/jointfitd/rig.toml" in (DEBIAN / "postinst").read_text()
     assert '"$1" = purge' in (DEBIAN / "postrm").read_text()

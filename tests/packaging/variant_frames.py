@@ -13,7 +13,7 @@ from jointfit_daemon.pipeline import Core
 from jointfit_variant import running_variant
 
 SECONDS = 14.0
-"""Duration that suffices for one estimate of the lag of every sensor, s."""
+"""Duration of the run, s. It suffices for one estimate of the lag of every sensor."""
 SILENT = ("S2", 3.0, 4.0)
 """Sensor without data, and begin and end of the gap, s."""
 

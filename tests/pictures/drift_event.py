@@ -63,7 +63,7 @@ def run() -> DriftRun:
 
 
 def moving_rms(values: Array) -> Array:
-    """Return the RMS over the last `MEAN_S` of every sample, shape (n,)."""
+    """Return, for each sample, the RMS of the values of the last `MEAN_S` seconds, shape (n,)."""
     squares = np.concatenate([[0.0], np.cumsum(values**2)])
     ends = np.arange(1, len(values) + 1)
     begins = np.maximum(ends - round(MEAN_S * RATE_HZ), 0)

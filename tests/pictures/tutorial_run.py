@@ -34,7 +34,7 @@ BASE = "jointfit/demo"
 QUALITY = 82
 """Quality of the WebP pictures."""
 WALK_S = 20.0
-"""Time after the calibration before the last pictures, s: the length of the curve."""
+"""Time for which the subject walks before the last pictures, s: the duration of the curve."""
 CLOCKS_S = 8.0
 """Time for the clocks of the sensors to settle, s."""
 MARKED_S = 4.0
@@ -42,7 +42,7 @@ MARKED_S = 4.0
 MARGIN_PX = 16.0
 """Margin below the recording in its picture."""
 START_S = 6.0
-"""Time until the subject walks after the calibration, s."""
+"""Time from the end of the calibration until the simulated subject walks, s."""
 MOST_LINES = 16
 SHOW_BROKER = """(address) => {
   const shown = document.querySelector("#broker-text");

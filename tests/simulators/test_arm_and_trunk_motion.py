@@ -54,7 +54,7 @@ def test_arm_is_rigid_and_its_joints_are_the_ends_of_its_bones(
     np.testing.assert_allclose(upper_arm.inv().apply(along), [[0, 0, -UPPER_ARM_M]], atol=1e-12)
     along = (pose.origins["hand"] - pose.origins["forearm"])[0]
     np.testing.assert_allclose(forearm.inv().apply(along), [[0, 0, -FOREARM_M]], atol=1e-12)
-    # Textbook sequence: flexion, carrying angle, pronation, each about the rotated axis.
+    # In textbooks, the sequence is flexion, carrying angle and pronation, about rotated axes.
     elbow = (upper_arm.inv() * forearm).as_euler("XYZ")
     np.testing.assert_allclose(elbow, [angles[6:9]], atol=1e-9)
 

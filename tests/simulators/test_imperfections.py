@@ -36,7 +36,7 @@ def rms(lengths: ArrayLike) -> float:
 def relative_orientations(
     knobs: Knobs, script: str = "walk:60,squat:60", t: np.ndarray = T
 ) -> list[Rotation]:
-    """Return the true rotations of S1 to S4 relative to their bones, including alignment."""
+    """Return the true rotations from the frames of S1 to S4 to the frames of their bones."""
     subject = SimulatedSubject(knobs, parse_motion_script(script))
     found = subject.observe([t] * 4, NONE, t)
     return [
@@ -47,6 +47,7 @@ def relative_orientations(
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_common_soft_tissue_artefact_is_equal_for_both_sensors_of_a_segment(seed: int) -> None:
+    """The common part of the artefact rotates both sensors of a segment together."""
     knobs = dataclasses.replace(NO_ERRORS, soft_tissue_common_deg=5.0, seed=seed)
     s1, s2, s3, s4 = relative_orientations(knobs)
     for first, second in ((s1, s2), (s3, s4)):
@@ -56,6 +57,7 @@ def test_common_soft_tissue_artefact_is_equal_for_both_sensors_of_a_segment(seed
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_single_soft_tissue_artefact_differs_between_sensors(seed: int) -> None:
+    """The single part of the artefact rotates each sensor separately."""
     knobs = dataclasses.replace(NO_ERRORS, soft_tissue_sensor_deg=3.0, seed=seed)
     s1, s2, s3, s4 = relative_orientations(knobs)
     for first, second in ((s1, s2), (s3, s4)):

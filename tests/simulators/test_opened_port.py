@@ -24,13 +24,14 @@ def line(tmp_path: Path) -> Iterator[PtyLine]:
 
 
 async def test_a_port_is_read_a_while_after_its_opening(line: PtyLine) -> None:
+    """A host counts as a reader `RESTART_S` after it has opened the port for the first time."""
     port = OpenedPort(line.link)
     read = [port.is_read]
     with SerialPort(str(line.link), 115_200):
         read.append(port.is_read)
         await asyncio.sleep(0.25)
         read.append(port.is_read)
-    read.append(port.is_read)  # only the first opening counts
+    read.append(port.is_read)  # unchanged after the host has closed the port
     assert read == [False, False, True, True]
 
 

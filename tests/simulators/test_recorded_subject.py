@@ -85,7 +85,7 @@ def test_static_pose_with_known_biases_is_upright(squats: list[Path]) -> None:
     bias = json.loads(squats[1].read_text())["q_bias"]["S1"]
     q_bias = Rotation.from_quat(np.array(bias)[[0, 3, 1, 2]], scalar_first=True)
     measured = Rotation.from_quat(found.sensors[0], scalar_first=True)
-    assert (measured * q_bias).magnitude().max() < 1e-9  # q_sensor q_bias = q_segment = identity
+    assert (measured * q_bias).magnitude().max() < 1e-9  # q_sensor q_bias = q_segment = 1
 
 
 def test_orientations_are_continuous_between_standing_and_trial(squats: list[Path]) -> None:

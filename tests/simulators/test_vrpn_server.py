@@ -119,6 +119,7 @@ async def test_a_ping_is_answered_with_the_type_that_the_server_described() -> N
 
 
 async def test_the_wall_clock_steps() -> None:
+    """A test can step the clock of the stamps."""
     async with serving() as server:
         server.stepped_ns = 10**10
         found = await answers(server, encode(Cookie()))

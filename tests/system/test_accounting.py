@@ -24,9 +24,10 @@ NOISY = (
 WIRES = (("S1",), ("S3",), ("S2", "S4"))
 """Sensors by wire. Corrupt bytes on a bus are counted by one of its sensors."""
 USED = 0.95
-"""Smallest share of received samples that are used. On a loaded machine, late samples count too."""
+"""Smallest accepted share of the received samples that are used, or on a loaded machine used or
+late."""
 OVERLOAD = 1.5
-"""Load factor above which the processes themselves make many samples late."""
+"""Load factor above which the load of the machine makes many samples late."""
 DROPOUTS = ("--set", "dropout=0.02", "--set", "latency_jitter_ms=3")
 
 

@@ -1,4 +1,4 @@
-"""Events and poses of a broker outage arrive after it, with a restart of the daemon in between."""
+"""Events and poses of a broker outage are published after it, even if the daemon was restarted."""
 
 from __future__ import annotations
 

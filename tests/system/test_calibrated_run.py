@@ -63,7 +63,7 @@ class CalibratedRun:
     chain: list[dict[str, Any]]
     """Payloads of `optical/chain`."""
     misfits: dict[str, str]
-    """Last difference between a payload and its model, by topic."""
+    """Last difference between a payload and the model of its topic, by topic."""
 
 
 async def calibrated_run(folder: Path, port: int) -> CalibratedRun:
@@ -214,6 +214,7 @@ def count_phases_in_the_log(run: CalibratedRun) -> None:
 
 
 def judge_the_optical_reference(run: CalibratedRun) -> None:
+    """Check the published differences between cameras and IMUs."""
     rate_hz = (len(run.optical) - 1) / (run.optical[-1]["t_us"] - run.optical[0]["t_us"]) * 1e6
     assert 10 < rate_hz <= 25.5  # includes the pause of the reload
     knees = [payload["joints"]["knee"] for payload in run.optical]
@@ -225,6 +226,7 @@ def judge_the_optical_reference(run: CalibratedRun) -> None:
 
 
 def judge_the_running_centers(run: CalibratedRun) -> None:
+    """Check that the joint centres estimated during the run agree with the calibrated centres."""
     stamps = [payload["t_us"] for payload in run.centers]
     assert all(b - a > 0.8e6 for a, b in pairwise(stamps))
     knees = [payload["joints"]["knee"] for payload in run.centers]
@@ -234,6 +236,7 @@ def judge_the_running_centers(run: CalibratedRun) -> None:
 
 
 def judge_the_chain_model(run: CalibratedRun) -> None:
+    """Check the fit of the chain model to the markers before and after their refinement."""
     rate_hz = (len(run.chain) - 1) / (run.chain[-1]["t_us"] - run.chain[0]["t_us"]) * 1e6
     assert 4 < rate_hz <= 10.5
     assert run.chain[-1]["fit"]["rms_m"] < 0.02

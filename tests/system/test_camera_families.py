@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(300)]
 
 # Two sensors use UARTs, and two use CAN. Drivers discard data that a device sends before the first
-# reply of its handshake. These devices send nothing before the handshake, or have no handshake.
+# reply of its handshake. These devices lose no sample in this way: they send nothing before the
+# handshake, or have no handshake.
 FAMILIES = {"S1": "bno085", "S2": "lpms-can", "S3": "serial-table", "S4": "can-table"}
 
 

@@ -49,9 +49,9 @@ pytestmark = pytest.mark.system
 PERIOD_NS = 10_000_000
 NMEA = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"
 MODEM = b"AT+CGMI\r\r\nERROR\r\n"
-"""Command of ModemManager and its echo."""
+"""Bytes of a device that answers a command of ModemManager: the repeated command, and an error."""
 MODEM_EVERY = 40
-"""Number of messages between two such commands."""
+"""Number of messages of the device between two commands of ModemManager."""
 SERVED_US, STALL_US = 200_000, 20_000
 """Conditions for the check of a pose, us. The simulated devices must have sent without a pause
 longer than `STALL_US`, from `SERVED_US` before the pose to `SERVED_US` after it. On a loaded

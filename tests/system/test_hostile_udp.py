@@ -1,4 +1,4 @@
-"""Hostile UDP datagrams: the daemon accepts those of its camera server only."""
+"""Hostile UDP datagrams: the daemon accepts only datagrams of its camera server."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ async def attacked(folder: Path, mqtt: int) -> AsyncIterator[tuple[AttackedCamer
 
 
 async def check_frames(listener: Listener) -> None:
-    """Check that camera frames and poses still arrive, and that the clock fit is still in use."""
+    """Check that frames and poses still arrive, and that the clock still uses echoes."""
     before = listener.latest["bridge/health"]["devices"]["mocap"]
     received = before["received"]
     after = (await listener.health(lambda d: d["mocap"]["received"] > received + 20))["mocap"]

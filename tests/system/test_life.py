@@ -1,4 +1,4 @@
-"""Stop of the daemon, and restarts and losses of the broker and the simulator around it."""
+"""The daemon stops in time, and survives restarts and losses of the broker and the simulator."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ SOURCES = {*SENSORS, "mocap"}
 RETAINED = ("bridge/state", "bridge/info", "calibration")
 OFFLINE, ONLINE = {"v": 1, "state": "offline"}, {"v": 1, "state": "online"}
 STOP_S = 5.0
-"""Limit of a stop by SIGTERM, s."""
+"""Longest accepted time from SIGTERM to the exit, s."""
 DEVICE_BACK_S = 2.5
-"""Limit from the return of devices to their availability, s."""
+"""Longest accepted time from the return of devices to their state online, s."""
 
 
 async def read_retained(port: int) -> dict[str, Any]:

@@ -135,6 +135,7 @@ def rms_deg(
 async def test_an_arm_is_calibrated_and_abducted_through_90_degrees_without_lock(
     tmp_path: Path, broker: Broker
 ) -> None:
+    """At 90 degrees, the shoulder angles have no gimbal lock."""
     station = Station(tmp_path, broker.port)
     async with playing(tmp_path, broker.port, "arm") as scene:
         station.write_rig()

@@ -56,7 +56,7 @@ async def next_figure(listener: Listener) -> dict[str, Any]:
 
 
 def only_the_hip_lacks(listener: Listener, reason: str) -> bool:
-    """Return whether only the hip has no position. The cameras also lose other markers."""
+    """Return whether the hip has no position for this reason, and the knee has a position."""
     hip, knee = joints(listener)["hip"], joints(listener)["knee"]
     return hip["refused"] == reason and hip["p_m"] is None and knee["p_m"] is not None
 

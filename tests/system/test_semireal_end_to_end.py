@@ -1,7 +1,7 @@
 """Recorded squats, sent as bytes through the daemon, reproduce the errors of the offline session.
 
-The only imperfections are those of the recording. The optical system streams the reference bones,
-segments have the axes of the static pose, and the daemon calibrates itself on the first 60 %.
+The simulation adds no errors to the recording. The optical system streams the reference bones, and
+segments have the axes of the static pose. The calibration uses the first 60 % of the squats.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ METHODS: tuple[Method, ...] = ("patent12", "mean")
 FRAMES = 270
 """Frames of the last 40 % of the squats."""
 PUBLISHED = (3.45, 2.81, 2.11)
-"""Errors of thigh, shank and flexion by `patent12` on all of these frames, deg."""
+"""RMS errors of thigh, shank and knee flexion with the method `patent12` on these frames, deg."""
 
 
 @pytest.fixture

@@ -63,7 +63,7 @@ async def test_wired_sync_line_removes_the_transport_delay(tmp_path: Path, broke
 
 @pytest.mark.timeout(180)
 async def test_cameras_on_ptp_need_no_echo_and_no_settling(tmp_path: Path, broker: Broker) -> None:
-    """Cameras on PTP stamp frames with UNIX time, which the daemon knows."""
+    """Cameras on PTP stamp frames with UNIX time, so the daemon need not request their time."""
     found = await live(tmp_path, broker.port, (), rest_s=3.0, more=("--ptp",))
     assert found.replayed
     errors = found.errors_ns(OPTICAL, "direct")

@@ -67,6 +67,7 @@ class TestXcdiOnVcanThatIsRemoved(TestXcdiOnVcanThatGoesDown):
 
 
 async def test_four_sensors_share_one_bus_and_each_gets_its_own(wire: PythonCanWire) -> None:
+    """Each driver receives only the frames of its own sensor."""
     bases = {f"S{n}": 0x100 * n for n in range(1, 5)}
     devices = [
         XcdiDevice(wire, XcdiDeviceOptions(ids=id_block(base), first_counter=base))

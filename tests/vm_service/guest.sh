@@ -1,5 +1,6 @@
 #!/bin/sh
-# Inside the virtual machine, as root: bring up buses, broker and package, run the tests, store their log.
+# This script runs inside the virtual machine as root. It starts the CAN bus and the broker, installs the package, runs the
+# tests, and stores their log.
 set -e
 cd /mnt
 mount -t hostfs none /lib/modules -o /usr/lib/uml/modules
@@ -13,8 +14,8 @@ ip link set lab up
 ip route add default dev lab
 ip route add multicast 239.0.0.0/8 dev lab
 
-# A bus: vcan for the hardware, brought up by the network file that the package ships.
-echo force-unsafe-io > /etc/dpkg/dpkg.cfg.d/unsafe-io  # the disk is thrown away
+# The CAN bus. The virtual interface vcan replaces the hardware. The network file of the package configures it.
+echo force-unsafe-io > /etc/dpkg/dpkg.cfg.d/unsafe-io  # without syncs, because the changes of the disk are discarded after the tests
 printf '[NetDev]\nName=can0\nKind=vcan\n' > /etc/systemd/network/80-can0.netdev
 dpkg -i jointfitd.deb
 cp /usr/share/jointfitd/networkd/80-jointfit-can0.network /etc/systemd/network/
@@ -22,7 +23,7 @@ for unit in jointfitd jointfitd@; do
     install -D -m 644 -t /etc/systemd/system/$unit.service.d /usr/share/jointfitd/systemd/jointfitd-can.conf
 done
 
-# A broker as docs/security.md sets it up: TLS with a private CA, passwords, the shipped access list.
+# The broker, as docs/security.md describes: TLS with a private CA, passwords, and the access list of the package.
 certs=/etc/mosquitto/certs
 openssl req -x509 -newkey rsa:2048 -nodes -days 2 -subj "/CN=test CA" -keyout $certs/ca.key -out $certs/ca.crt 2>/dev/null
 openssl req -newkey rsa:2048 -nodes -subj "/CN=localhost" -keyout $certs/broker.key -out $certs/broker.csr 2>/dev/null
@@ -41,7 +42,7 @@ install -d -m 700 /etc/credstore
 printf s3cret > /etc/credstore/jointfitd.mqtt-password
 chmod 600 /etc/credstore/jointfitd.mqtt-password
 
-# Virtual sensors: two on real ptys, two on can0, cameras on loopback.
+# The simulator: two sensors on pseudo-terminals, two sensors on can0, and cameras on the loopback interface.
 mkfifo /run/sim.commands
 cat > /run/systemd/system/jointfit-sim.service <<'UNIT'
 [Service]

@@ -74,6 +74,7 @@ def test_angles_give_the_rotation_that_scipy_gives(
 
 
 def test_the_message_of_the_data_sheet_fits_pitch_about_x_and_roll_about_y() -> None:
+    """In this message, the acceleration agrees with the angles only in the Euler order zxy."""
     measured = np.array((-371, -20, 977)) / np.linalg.norm((-371, -20, 977))
     assert gravity_of(EXAMPLE, "zxy") == pytest.approx(measured, abs=0.002)
     cosine = gravity_of(EXAMPLE, "zyx") @ measured
@@ -82,6 +83,7 @@ def test_the_message_of_the_data_sheet_fits_pitch_about_x_and_roll_about_y() -> 
 
 @pytest.mark.parametrize(("euler", "reported"), [("zxy", False), ("zyx", True)])
 def test_accelerations_at_rest_reveal_the_wrong_order(euler: str, reported: bool) -> None:
+    """A configured Euler order that contradicts the acceleration at rest is reported."""
     frames = [encode_rvc(RvcFrame(k & 0xFF, EXAMPLE, (-371, -20, 977))) for k in range(150)]
     found = texts(run(decoder(115_200, euler=euler), frames))
     assert any('fit euler = "zxy", not "zyx"' in text for text in found) == reported
@@ -89,6 +91,7 @@ def test_accelerations_at_rest_reveal_the_wrong_order(euler: str, reported: bool
 
 
 def test_a_level_or_moving_device_reveals_nothing() -> None:
+    """The Euler order can only be checked with a tilted device at rest."""
     level = [encode_rvc(RvcFrame(k & 0xFF, (k, 5, -5), (0, 0, 1000))) for k in range(256)]
     moving = [encode_rvc(RvcFrame(k & 0xFF, EXAMPLE, (900, 900, 977))) for k in range(256)]
     assert texts(run(decoder(115_200, euler="zyx"), level + moving)) == []
@@ -121,6 +124,7 @@ def rotation(
 
 
 def test_the_real_part_comes_last_and_a_sample_is_older_than_its_packet() -> None:
+    """A report contains x, y, z, w in this order. The packet contains the age of its reports."""
     bno = decoder(3_000_000, transport="usb")
     (sample,) = samples(bno.feed(Chunk(10**9, b"\x7e" + packet(rotation(7, delay=20), age=50))))
     assert sample.q_world_sensor == pytest.approx((0.8, 0.0, 0.0, 0.6), abs=1e-4)
@@ -149,13 +153,13 @@ def test_lost_reports_restarts_and_accuracy_are_events() -> None:
 
 
 def channel_5(number: int, *rows: tuple[int, ...]) -> bytes:
-    """Return a packet as the device sends it: values alone, without base time and report head."""
+    """Return a packet as the device sends it: values alone, without base time and report header."""
     body = b"".join(struct.pack("<7h", *row) for row in rows)
     return b"\x7e\x01" + struct.pack("<HBB", len(body) + 4, 5, number) + body + b"\x7e"
 
 
 def test_gyro_rotation_vectors_of_channel_5_have_rates_but_no_age() -> None:
-    row = (0, 0, 9830, 13107, 1024, -512, 256)  # 2^-14 and 2^-10 rad/s
+    row = (0, 0, 9830, 13107, 1024, -512, 256)  # units: 2^-14 (quaternion), 2^-10 rad/s (rates)
     bno = decoder(3_000_000, transport="usb")
     wire = channel_5(9, row, row) + channel_5(12, row)
     events = bno.feed(Chunk(10**9, wire))
@@ -170,6 +174,7 @@ def test_gyro_rotation_vectors_of_channel_5_have_rates_but_no_age() -> None:
 
 
 def test_one_kind_of_rotation_vectors_is_used() -> None:
+    """Rotation vectors of another kind are used only until the configured kind arrives."""
     game = HubReport(HubReportId.GAME_ROTATION_VECTOR, 1, 3, 0, (0.6, 0.0, 0.0, 0.8))
     wire = [b"\x7e" + packet(game), packet(game, rotation(1)), packet(game, rotation(2))]
     found = [item.q_world_sensor for item in samples(run(decoder(3_000_000), wire))]

@@ -76,6 +76,7 @@ async def test_a_rate_that_the_device_does_not_accept_is_refused(tmp_path: Path)
 
 
 async def test_the_other_mode_is_named(tmp_path: Path) -> None:
+    """The device is in the mode RVC and the driver expects SHTP, or the reverse."""
     text = await refusal(tmp_path, device(tmp_path, mode="rvc", checks_speed=True), 3_000_000)
     assert "the device sends UART-RVC: set baud = 115200" in text
     bno = device(tmp_path, checks_speed=True)

@@ -45,6 +45,7 @@ def test_the_wrong_order_of_frames_is_named() -> None:
 
 @pytest.mark.parametrize("sent", [b"\x55\x03", b"\x54\x01"])
 def test_frames_with_other_first_bytes_are_no_silent_loss(sent: bytes) -> None:
+    """Frames whose first bytes differ from `starts_with` are reported."""
     (text,) = warnings(PAGES, (0x200, sent + bytes(6)))
     assert "because first (0x200), second (0x200) never arrived; 300 frames have these" in text
     assert "correct `starts_with` or `dbc`" in text

@@ -169,7 +169,7 @@ def test_field_between_messages_is_rotated_after_its_offset_is_removed() -> None
         values = (90.0 + 1.0, -2.0, 0.5, 0.0, 0.0, 1.0)
         out += device.samples(XImu3Data(DataKind.INERTIAL, 20_000 * k, values), k) or []
     last = [each for each in out if isinstance(each, ImuSample)][-1]
-    # the corrected field, turned by 90 degrees per second for 0.1 s, keeps its magnitude
+    # the corrected field, rotated about x by 90 degrees per second for 0.1 s, keeps its magnitude
     true = np.array((22.0, 13.5, -40.0))
     assert last.magnetic is not None
     assert np.linalg.norm(last.magnetic) == pytest.approx(np.linalg.norm(true), rel=1e-3)

@@ -1,4 +1,8 @@
-"""Filter of an IMU that starts in motion: errors of orientation and bias, and stated deviation."""
+"""The orientation filter of the gateway, for an IMU that starts in motion.
+
+The tests limit the errors of the orientation and of the gyroscope bias. They compare the error of
+the bias with the standard deviation that the filter states.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +28,7 @@ SEEDS = range(6)
 
 @dataclass(frozen=True)
 class MovingSensor:
-    """Readings of a simulated sensor, and its true orientation and bias."""
+    """Readings of a simulated sensor, its true orientation, and its true gyroscope bias, rad/s."""
 
     readings: list[RawReading]
     q: Array
@@ -33,7 +37,7 @@ class MovingSensor:
 
 @dataclass(frozen=True)
 class Run:
-    """Errors of the filter, NaN where it has no output, and stated deviation of the bias."""
+    """Errors of the filter, and its standard deviation of the bias; NaN while it has no output."""
 
     error_deg: Array
     bias_error: Array
@@ -45,7 +49,7 @@ class Run:
 def sensor(
     seed: int, *, speed: float = 0.3, rest_s: float = 0.0, seconds: float = 14.0
 ) -> MovingSensor:
-    """Simulate a sensor that rotates by about 50 degrees and moves, with a rest at the end."""
+    """Simulate a sensor that rotates by about 50 degrees and moves, and then rests for `rest_s`."""
     rng = np.random.default_rng(seed)
     t_s = np.arange(round(seconds * RATE_HZ) * FINE) / (RATE_HZ * FINE)
     moving = 1.0 / (1.0 + np.exp((t_s - (seconds - rest_s)) / 0.1)) if rest_s else np.ones(len(t_s))

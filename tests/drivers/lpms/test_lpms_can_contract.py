@@ -55,7 +55,8 @@ class TestLpmsInCanopenStyle(DriverContract):
     @override
     def make_driver(self, folder: Path) -> Driver:
         path = str(folder / "adapter")
-        # The suite sends a sample every 2 ms. The driver joins frames within half a period.
+        # A test sends a sample every 2 ms. The driver joins the frames of a sample only if they
+        # arrive within half a sample period.
         more = {"rate_hz": 500}
         return LpmsCanImu(settings("slcan", path, self.numbers, self.mode, self.precision, **more))
 
@@ -85,14 +86,15 @@ class TestLpmsInSequentialMode(TestLpmsInCanopenStyle):
         """Return whether `measurement` has the orientation of sample `number`, within 0.09 rad.
 
         The line of an adapter has no checksum. A wrong digit of a small component changes the norm
-        by less than 1 %, which is accepted, and the orientation by less than 0.09 rad.
+        by less than 1 %, so the sample is accepted. It changes the orientation by less than
+        0.09 rad.
         """
         products = zip(orientation(number), measurement.q_world_sensor, strict=True)
         return bool(abs(sum(a * b for a, b in products)) > 1 - 1e-3)
 
 
 class TestLpmsOfOldFirmwareOnABusWithoutDescriptor(DriverContract):
-    """The sensor sends thousandths with spaced identifiers on an in-process bus."""
+    """The sensor sends units of 1/1000 with the identifiers of old firmware, in process."""
 
     registered_as = "lpms-can"
     has_noise = False

@@ -86,7 +86,7 @@ def texts(events: list[Decoded], kind: str) -> list[str]:
 
 
 def test_lpbus_in_can_frames_is_the_stream_of_the_serial_line() -> None:
-    """LP-BUS in CAN frames is the third mode of generation 1, which no driver reads."""
+    """Generation 1 has this third mode on CAN. No driver supports the mode."""
     frames = recorded(3, mode="lpbus", node=1)
     assert {frame.can_id for frame in frames} == {0x515}
     assert max(len(frame.data) for frame in frames) == 8
@@ -130,6 +130,7 @@ def test_every_sample_arrives_with_the_stamp_of_its_first_frame(case: str) -> No
 
 
 def test_halves_out_of_order_are_counted_and_reported() -> None:
+    """A quaternion of 32-bit floats takes two frames: its halves."""
     wire = RecordingWire()
     device = LpmsCanDevice(wire, LpmsCanDeviceOptions(precision="float32"))  # type: ignore[arg-type]
     device.swapped = True
@@ -154,6 +155,7 @@ def test_a_lost_half_costs_one_sample() -> None:
 
 
 def test_frames_that_the_host_lost_end_an_open_sample() -> None:
+    """The second frame of the open sample may be among the lost ones."""
     frames = recorded(2, precision="float32", heartbeat_hz=0, sends_idle_frames=False)
     (first, _), (_, last) = frames[:2], frames[2:]
     near = last._replace(t_ns=first.t_ns + 1000)
@@ -190,6 +192,7 @@ def arrivals(gaps: ArrivalGaps, times: list[float]) -> tuple[int, list[float]]:
 
 @given(st.integers(0, 2**32), st.integers(20, 150), st.integers(1, 7))
 def test_delays_are_no_losses_and_losses_are_counted(seed: int, place: int, lost: int) -> None:
+    """Samples without a counter are counted by the times of their arrival."""
     chance = random.Random(seed)
     sound = [10.0 * k + (chance.uniform(0, 8) if k % 9 else 0.0) for k in range(200)]
     assert arrivals(ArrivalGaps(100.0), sound) == (0, [])

@@ -44,7 +44,7 @@ class TestLpmsOfGeneration3(DriverContract):
 
 
 class TestLpmsOfGeneration1(TestLpmsOfGeneration3):
-    """Old firmware that is already configured sends 16-bit thousandths and acknowledges nothing."""
+    """The old firmware sends 16-bit units of 1/1000 and acknowledges no command."""
 
     # Every connection waits for acknowledgements that this firmware does not send.
     starts_within_s = 15.0
@@ -68,7 +68,7 @@ class TestLpmsOfGeneration1(TestLpmsOfGeneration3):
 
 
 class TestLpmsWithLongAddressAndOtherConvention(TestLpmsOfGeneration3):
-    """The checksum sums words, the world is ENU, and the sensor starts in command mode."""
+    """The checksum adds 16-bit words, the world is ENU, and the sensor starts in command mode."""
 
     @override
     def make_device(self, folder: Path, wire_noise: WireNoise) -> LpmsDevice:

@@ -201,7 +201,7 @@ def test_float_seconds_that_nothing_announces_are_reported() -> None:
     assert texts(back, "warning") == ['device time is not float seconds: set device_time = "ticks"']
 
 
-ORDERS = {  # from the vendor: value counts of the outputs before and after the quaternion
+ORDERS = {  # numbers of values of each output before and after the quaternion, from the vendor
     1: ((3, 3, 3, 3), (3, 3, 1, 1, 1, 1)),
     3: ((3,) * 11, (3, 3, 1, 1, 1)),
 }
@@ -251,6 +251,7 @@ def test_an_acceleration_at_rest_is_no_quaternion() -> None:
 
 
 def test_packets_before_a_reply_with_the_outputs_are_decoded_with_it() -> None:
+    """Packets are stored until a reply names the outputs, and then decoded."""
     values = struct.pack("<I7f", 5, 0.1, 0.2, 0.3, 0.5, 0.5, 0.5, -0.5)
     mask = (1 << 18 | 1 << 16).to_bytes(4, "little")  # angular velocity and quaternion
     wires = [encode(LpmsCommand.DATA, values), encode(0x04, mask)]
@@ -265,6 +266,7 @@ def test_packets_before_a_reply_with_the_outputs_are_decoded_with_it() -> None:
 def test_the_stamps_of_a_file_of_raw_bytes_do_not_contradict_the_device_time(
     ratio: int, reported: bool
 ) -> None:
+    """If device time runs much faster than arrivals, the data come from a file without stamps."""
     check = TickRateCheck(500, is_seconds=False)
     found = [check.feed(500 * ratio * second, second * 10**9) for second in range(10)]
     assert any(found) == reported

@@ -94,6 +94,7 @@ async def test_a_sensor_that_is_right_is_only_read(tmp_path: Path, generation: A
 async def test_differences_are_set_and_lost_with_power(
     tmp_path: Path, generation: Any, precision: str
 ) -> None:
+    """Without `persist`, different settings are changed until the next power cycle only."""
     device = device_on(tmp_path, generation=generation)
     before = device.flash
     run = await sampled(device, make(tmp_path, generation=generation, precision=precision))
@@ -107,6 +108,7 @@ async def test_differences_are_set_and_lost_with_power(
 
 @pytest.mark.parametrize("generation", [1, 3])
 async def test_persist_stores_them_once(tmp_path: Path, generation: Any) -> None:
+    """With `persist`, different settings are stored in flash memory, at the first start only."""
     device = device_on(tmp_path, generation=generation)
     await sampled(device, make(tmp_path, generation=generation, persist=True))
     assert device.flash.outputs == TABLES[generation].quaternion
@@ -130,7 +132,7 @@ async def test_the_wrong_generation_is_refused_before_any_harm(
 
 
 async def test_commands_of_the_other_generation_do_harm_in_the_simulator(tmp_path: Path) -> None:
-    """If the sensor reports no generation, the driver uses `generation`, which may be wrong."""
+    """A sensor that reports no generation receives the commands of the configured generation."""
     third = device_on(tmp_path, generation=3, identifies=False)
     await refusal(third, make(tmp_path, generation=1), DeviceLostError)
     assert third.flash_writes > 0  # caused by the read command 0x04 of generation 1

@@ -268,6 +268,7 @@ def test_a_changed_number_of_channels_is_named_after_reconnection() -> None:
 
 
 def test_comparisons_of_the_clocks_are_echoes() -> None:
+    """A comparison of the clocks of host and sender is decoded as a `ClockEcho`."""
     feed = Feeder(marker("T1"))
     assert feed.trip() == []  # the clock of the stamps is not known before the first sample
     feed(1.0, 2.0, 3.0, at_s=0.1, late_ns=2_000_000)
@@ -279,6 +280,7 @@ def test_comparisons_of_the_clocks_are_echoes() -> None:
 
 
 def test_stamps_of_another_clock_are_reported_and_give_no_echo() -> None:
+    """The stamps are not from the clock of the sender that LSL compares with that of the host."""
     feed = Feeder(marker("T1"))
     feed(1.0, 2.0, 3.0)
     feed.trip(difference_s=-900.0)

@@ -111,7 +111,7 @@ def lsl_threads() -> list[str]:
 
 async def test_ended_connections_leave_no_tasks_threads_and_descriptors(lsl_network: Any) -> None:
     source, reading = server("T1"), Reading()
-    async with reading.connected():  # liblsl creates objects with the lifetime of the process
+    async with reading.connected():  # the first one creates permanent objects of liblsl
         await reading.frames(source, 3)
     before, tasks = count_descriptors(), asyncio.all_tasks()
     for pause_s in (0.0, 0.02, 0.35):
@@ -121,7 +121,7 @@ async def test_ended_connections_leave_no_tasks_threads_and_descriptors(lsl_netw
         await reading.frames(source, 3)
 
     assert asyncio.all_tasks() == tasks
-    async with asyncio.timeout(30):  # the outlet notices the end when it sends
+    async with asyncio.timeout(30):  # the outlet detects the end of a connection only when it sends
         while count_descriptors() > before or lsl_threads():
             source.push(0, {}, {})
             await asyncio.sleep(0.05)

@@ -44,7 +44,7 @@ class TestMip(DriverContract):
 
 
 class TestMipLegacyThatStreamsBothSetsFromTheStart(TestMip):
-    """The device sends old samples first, and also orientations of the other data set."""
+    """The device first sends old samples. It sends two data sets; the driver uses one."""
 
     @override
     def make_device(self, folder: Path, wire_noise: WireNoise) -> MipDevice:

@@ -55,6 +55,7 @@ def test_invalid_orientations_are_dropped_and_reported_once() -> None:
 
 
 def test_orientations_of_the_other_set_are_not_mixed_in_but_named() -> None:
+    """`estimator` selects the data set: "filter" or "sensor". The other set is not used."""
     wires = [sensor_packet(k * PERIOD_NS) for k in range(30)]
     found = decoded(wires)
     assert samples(found) == []
@@ -64,6 +65,7 @@ def test_orientations_of_the_other_set_are_not_mixed_in_but_named() -> None:
 
 
 def test_time_of_another_set_is_not_used() -> None:
+    """A packet of the sensor data set does not change the time of the filter data set."""
     pairs = [
         (sensor_packet(k * PERIOD_NS + 7_000_000), filter_packet(k * PERIOD_NS)) for k in range(20)
     ]
@@ -73,6 +75,7 @@ def test_time_of_another_set_is_not_used() -> None:
 
 
 def test_without_any_time_samples_carry_their_arrival_only() -> None:
+    """If no packet has a time field, the samples have no device time."""
     found = decoded([filter_packet(None)] * 5)
     assert [one.ticks for one in samples(found)] == [None] * 5
     assert len(events_of(found, "warning")) == 1

@@ -73,6 +73,7 @@ async def test_differences_are_written_and_saved_only_with_persist(
 
 
 async def test_one_decimation_for_orientation_and_time(tmp_path: Path) -> None:
+    """If their decimations differ, the driver sets one decimation for both fields."""
     options = MipDeviceOptions(formats=((0x82, ((0xD5, 50), (0x03, 5))),), streams=(0x82,))
     device = MipDevice(tmp_path / "imu", options=options)
     async with serving(device, feeding=True):

@@ -72,6 +72,7 @@ def test_unknown_names_are_reported_together_with_suggestions() -> None:
 
 
 def test_no_marker_is_suggested_for_two_names() -> None:
+    """T3 is the nearest marker of both unknown names, Tt3 and T33."""
     feeder = ready(markers={"thigh": ["T1", "T2", "Tt3"], "shank": ["S1", "S2", "T33"]})
     (warning,) = told(feeder.events, "warning")
     assert "'Tt3' (mocap.markers.thigh) is not in the stream; did you mean 'T3'? " in warning.text
@@ -85,6 +86,7 @@ def test_a_marker_in_use_is_not_suggested_for_another_one() -> None:
 
 
 def test_marker_names_come_from_the_description_before_the_set_before_a_number() -> None:
+    """A marker without a name in the body has its name in the marker set, or else a number."""
     named = described("A", 1, "own", "", named=True)
     model = ModelDefinition((named, MarkerSetDescription("A", ("set1", "set2", "set3"))))
     feeder = Feeder(version=(4, 0))
@@ -146,6 +148,7 @@ def test_a_body_and_a_skeleton_with_one_id_lose_their_markers_only() -> None:
 
 
 def test_an_id_that_occurs_twice_in_a_frame_is_absent_twice() -> None:
+    """Of two items with the same id, neither is used."""
     q = (0.0, 0.0, 0.0, 1.0)
     for times in (2, 3):
         got = ready().frame(

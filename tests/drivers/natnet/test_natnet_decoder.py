@@ -71,6 +71,7 @@ def test_an_untracked_body_is_absent_though_its_last_pose_is_repeated() -> None:
 def test_a_rotation_that_is_none_is_absent_and_counted(
     q: tuple[float, float, float, float],
 ) -> None:
+    """A quaternion whose norm is not 1 is no rotation."""
     feeder = ready()
     got = feeder.frame(frame(1, bodies=(body(1, q),)))
     assert np.isnan(got.body_orientations).all()
@@ -137,6 +138,7 @@ def test_the_world_is_turned_so_that_up_is_z_and_bodies_keep_their_axes(
 
 
 def test_ticks_are_the_exposure_and_the_clock_is_the_servers() -> None:
+    """The time of a frame is the exposure of its images, in ticks of the server clock."""
     assert Feeder().decoder.tick_clock is None
     feeder = ready()
     assert feeder.decoder.tick_clock == TickClock(0, None, 10_000_000)
@@ -144,6 +146,7 @@ def test_ticks_are_the_exposure_and_the_clock_is_the_servers() -> None:
 
 
 def test_without_exposure_stamps_the_configured_latency_is_used_and_reported_once() -> None:
+    """The latency from exposure to a later stamp of the server is subtracted from this stamp."""
     feeder = ready(latency_ms=8.0)
     got = [feeder.frame(frame(n, exposure=0, ticks=10**6 + n)) for n in (1, 2)]
     assert got[0].ticks == 10**6 + 1 + 2 - 80_000
@@ -151,6 +154,7 @@ def test_without_exposure_stamps_the_configured_latency_is_used_and_reported_onc
 
 
 def test_echo_yields_both_host_stamps_and_foreign_echoes_are_ignored() -> None:
+    """An echo is the answer of the server to a request, with the host time of the request."""
     feeder = ready()
     events = feeder(EchoResponse(1_000, 77), t_ns=500_000)
     assert events == [ClockEcho(1_000, 500_000, 77)]
@@ -159,12 +163,14 @@ def test_echo_yields_both_host_stamps_and_foreign_echoes_are_ignored() -> None:
 
 
 def test_a_recorded_echo_request_lends_its_arrival_to_the_answer() -> None:
+    """In a capture, the packet time of the request replaces the host time in the answer."""
     feeder = ready()
     assert not feeder(EchoRequest(42), t_ns=5_000)
     assert feeder(EchoResponse(42, 9), t_ns=6_000) == [ClockEcho(5_000, 6_000, 9)]
 
 
 def test_gaps_are_counted_repeats_and_overtaken_frames_dropped() -> None:
+    """An overtaken frame is one that arrives after a later frame."""
     feeder = ready()
     feeder(*(frame(n) for n in (1, 2, 5, 5, 4, 6)))
     assert [e.number for e in feeder.events if isinstance(e, MocapFrame)] == [1, 2, 5, 6]
@@ -187,6 +193,7 @@ def test_loop_of_a_short_recording_is_a_restart() -> None:
 
 
 def test_another_server_in_its_place_is_a_restart_without_names() -> None:
+    """After the restart, the names of markers and bodies are unknown until the next description."""
     feeder = ready()
     out = feeder(INFO._replace(clock_hz=3_312_787), frame(1))
     assert len(told(out, "restart")) == 1
@@ -209,6 +216,7 @@ def test_frames_before_the_model_are_counted_and_not_published() -> None:
 
 
 def test_edit_mode_is_reported_at_begin_and_end_and_its_frames_are_not_live() -> None:
+    """In edit mode, the camera software plays recorded data."""
     feeder = ready()
     got = [feeder.frame(frame(n, params=p)) for n, p in ((1, 0), (2, 4), (3, 4), (4, 0))]
     assert [one.live for one in got] == [True, False, False, True]
@@ -223,6 +231,7 @@ def test_a_changed_model_is_announced_once() -> None:
 
 
 def test_the_bitstream_follows_the_response_and_the_frames_stay_readable() -> None:
+    """The response announces another bitstream, which the next frames have."""
     feeder = ready()
     assert feeder(CommandResponse(b"Bitstream,4.1\0")) == []
     feeder.version = (4, 1)
@@ -233,6 +242,7 @@ def test_the_bitstream_follows_the_response_and_the_frames_stay_readable() -> No
 
 
 def test_frames_in_the_requested_bitstream_are_decoded_without_confirmation() -> None:
+    """The driver requested bitstream 4.1, and the response was lost."""
     feeder = ready(bitstream="4.1")
     feeder.version = (4, 1)
     out = feeder(frame(1, markers=(marker(65537, (1.0, 2.0, 3.0)),)))
@@ -285,6 +295,7 @@ def test_a_datagram_is_a_message_or_counted_lost(data: bytes) -> None:
 
 
 def test_the_real_capture_decodes_whole_from_itself_alone(shared_data: Path) -> None:
+    """The capture contains the descriptions that its frames need."""
     path = shared_data / "mocap" / "natnet_v3_mje-nz" / "test_data" / "raw" / "traffic.pcapng"
     decoder = NatNetDecoder(NatNetSettings(driver="natnet", server="x", up_axis="z"))
     events = [event for chunk in read_capture(path, "datagram") for event in decoder.feed(chunk)]

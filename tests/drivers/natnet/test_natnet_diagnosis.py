@@ -166,6 +166,7 @@ def test_the_choice_of_the_network_card_is_checked(
 
 
 def test_two_cards_are_a_note_with_frames_and_nothing_once_one_is_chosen() -> None:
+    """If frames arrive, a second card that reaches the server is a note and no fault."""
     cards = [ETH, WLAN]
     where = ("motive", "192.168.1.20", ETH.address, ETH.address, cards)
     (risk,) = card_findings(*where, arrived=True)
@@ -187,6 +188,8 @@ async def test_multicast_frames_are_counted_at_each_card() -> None:
 async def test_frames_at_another_card_are_multicast_on_two_interfaces(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """The server may send multicast through another card than the configured one."""
+
     async def at_the_other(*_: object) -> dict[str, int]:
         return {ETH.address: 0, OTHER.address: 90}
 

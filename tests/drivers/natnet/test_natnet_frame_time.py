@@ -116,6 +116,7 @@ def test_begin_and_end_of_a_timecode_are_reported() -> None:
 def test_a_timecode_lies_in_the_bytes_from_the_highest(
     parts: tuple[int, int, int, int], subframe: int
 ) -> None:
+    """The bytes are hours, minutes, seconds and frames."""
     found = timecode_of(
         FrameOfData(
             1, 0.0, 1, 2, 3, timecode=int.from_bytes(bytes(parts), "big"), subframe=subframe

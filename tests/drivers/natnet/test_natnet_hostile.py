@@ -71,16 +71,19 @@ def test_stamps_beyond_64_bits_of_nanoseconds_are_no_time() -> None:
 
 
 def test_the_latency_of_usb_cameras_does_not_lead_before_the_start_of_the_counter() -> None:
+    """A device time before the start of the server counter would be negative."""
     assert ready(latency_ms=10.0).frame(frame(1, exposure=0, ticks=5)).ticks == 0
 
 
 @pytest.mark.parametrize("far", [1e38, -20_000.0, float("inf"), float("nan")])
 def test_position_of_an_occluded_marker_is_unknown(far: float) -> None:
+    """A position that is not finite or too far from the origin means an occluded marker."""
     got = ready().frame(frame(1, markers=(marker(65537, (0.0, far, 0.0)),)))
     assert np.isnan(got.markers).all()
 
 
 def test_a_frame_number_that_was_not_counted_up_to_is_a_restart_and_no_loss() -> None:
+    """The number increases by more than the elapsed time permits."""
     feeder = ready()
     feeder(frame(1))
     out = feeder(frame(2**31 - 1, ticks=10**6), t_ns=S)
@@ -131,6 +134,7 @@ def giant(count: int) -> ModelDefinition:
 def test_a_model_of_one_datagram_costs_no_second_and_bounded_columns(
     model: ModelDefinition,
 ) -> None:
+    """A hostile model with many items takes less than 1 s, and at most 4000 items are columns."""
     feeder = Feeder(markers={"thigh": ["T1", "T2", "T3", "T4"]})
     feeder(INFO)
     began = time.process_time()
@@ -157,6 +161,7 @@ def test_a_model_of_one_datagram_costs_no_second_and_bounded_columns(
 def test_an_answer_is_accepted_once_in_time_and_only_when_asked_for(
     question: Message, answer: Message
 ) -> None:
+    """An answer must follow its request within a time limit."""
     questions, data = OpenRequests(), encode(answer)
     assert not questions.accept(data, S)
     questions.register(question, S)

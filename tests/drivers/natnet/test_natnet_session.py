@@ -89,6 +89,8 @@ async def test_the_real_capture_plays_through_socket_and_driver_frame_by_frame(
 
 
 async def test_ten_echoes_in_the_first_second_hold_the_servers_clock() -> None:
+    """Each echo contains a server time between the request and the arrival of the answer."""
+
     def clock_echoes() -> list[ClockEcho]:
         return [event for event in heard.events if isinstance(event, ClockEcho)]
 

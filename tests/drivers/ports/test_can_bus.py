@@ -52,6 +52,7 @@ def two_sensors(adapter: SlcanAdapter) -> tuple[XcdiDevice, XcdiDevice]:
 
 
 async def test_two_sensors_on_one_adapter_each_get_their_own(tmp_path: Path) -> None:
+    """Each driver receives only the samples of its own sensor."""
     adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
     devices = two_sensors(adapter)
     async with serving(*devices):
@@ -155,6 +156,7 @@ async def test_only_the_silent_sensor_is_lost_and_its_report_lists_received_iden
 async def test_identifiers_of_a_sensor_that_waits_for_its_retry_are_not_unclaimed(
     tmp_path: Path,
 ) -> None:
+    """The report of one sensor does not list identifiers of another configured sensor."""
     adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
 
     async def without_orientation() -> None:
@@ -179,6 +181,7 @@ async def test_identifiers_of_a_sensor_that_waits_for_its_retry_are_not_unclaime
 async def test_a_sensor_that_worked_and_falls_silent_has_one_text_at_all_attempts(
     tmp_path: Path,
 ) -> None:
+    """An error that is repeated with the same text is logged once."""
     adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
     device = XcdiDevice(adapter, XcdiDeviceOptions(ids=id_block(0x100)))
     driver, told = xcdi_driver("S3", bus, 0x100, silence_s=0.2), []
@@ -195,7 +198,7 @@ async def test_a_sensor_that_worked_and_falls_silent_has_one_text_at_all_attempt
 async def test_a_sensor_that_came_late_is_reported_as_soon_as_one_that_was_there(
     tmp_path: Path,
 ) -> None:
-    """The longer waits between attempts on a silent bus end with the first frame."""
+    """On a silent bus, the waits between attempts become longer. The first frame ends a wait."""
     adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
     device = XcdiDevice(adapter, XcdiDeviceOptions(ids=id_block(0x100)))
     driver = xcdi_driver("S3", bus, 0x100, silence_s=0.2)
@@ -227,6 +230,7 @@ async def test_a_sensor_with_other_identifiers_is_hinted_at(tmp_path: Path) -> N
 async def test_identifiers_of_another_width_are_no_reason_to_change_their_number(
     tmp_path: Path, extended: bool
 ) -> None:
+    """The number arrives with 29 instead of 11 bits, or the reverse: `extended_ids` is wrong."""
     adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
     device = XcdiDevice(adapter, XcdiDeviceOptions(ids=id_block(0x200, extended=not extended)))
     ids = XcdiIdSettings(sample_time=0x205, group_counter=0x206, quaternion=0x221)

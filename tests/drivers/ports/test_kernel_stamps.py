@@ -22,7 +22,11 @@ class Clocks:
 
 
 def stamped(clocks: Clocks, stamps: KernelStamps, ago_ns: int, offset: int | None = None) -> int:
-    """Return the time since the end of a frame by its stamp, ns; the true time is `ago_ns`."""
+    """Return the time from the end of a frame until now, ns, as computed from its kernel stamp.
+
+    The true time is `ago_ns`. At the time of the stamp, the wall clock minus the monotonic clock is
+    `offset`, or its current value if `offset` is None.
+    """
     unix = clocks.monotonic - ago_ns + (clocks.offset if offset is None else offset)
     start = stamps.start_ns(unix / S, 8, extended=False)
     return clocks.monotonic - start - frame_bits(8, extended=False) * 1000

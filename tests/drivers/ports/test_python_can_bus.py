@@ -47,7 +47,7 @@ async def test_a_bus_of_python_can_is_shared_too() -> None:
 
 
 class Broken(can.BusABC):
-    """Replacement for a vendor's library, which fails during reading."""
+    """Replacement for the library of a vendor. Its reads fail with the given error."""
 
     def __init__(self, error: Exception) -> None:
         super().__init__(channel="x")
@@ -113,6 +113,7 @@ async def test_unknown_interfaces_are_named_with_the_nearest() -> None:
 async def test_a_bus_that_cannot_exist_here_has_one_text_in_check_and_daemon(
     table: dict[str, Any], words: str
 ) -> None:
+    """`jointfit check` and the daemon report the same text."""
     bus = CanBusSettings(**{"channel": "0"} | table)
     with pytest.raises(ValidationError, match=words):
         xcdi_driver("S3", bus)
@@ -146,6 +147,8 @@ async def test_an_absent_port_of_an_adapter_is_named_once() -> None:
 async def test_kernels_without_can_and_absent_links(
     monkeypatch: pytest.MonkeyPatch, number: int, kind: type[Exception], words: str
 ) -> None:
+    """An absent interface may appear later. A kernel without CAN is a wrong setup."""
+
     def refuse(_: str) -> None:
         raise OSError(number, "as the kernel says it")
 

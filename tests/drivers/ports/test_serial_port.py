@@ -221,6 +221,7 @@ def test_an_error_of_system_or_hardware_may_be_temporary(
 
 
 def test_the_descriptor_is_closed_on_the_way_out(pty: Pty) -> None:
+    """The end of the block closes the port, also after an exception."""
     before = len(list(Path("/proc/self/fd").iterdir()))
     with SerialPort(pty.path, 115200):
         pass

@@ -13,7 +13,7 @@ from tests.drivers.ports.socket_options import needs_kernel_stamps
 
 LOOPBACK = "127.0.0.1"
 STAMPS_BEGIN_S = 0.1
-"""Time after which the kernel stamps data, if no other socket had requested stamps, s."""
+"""Time from the first request for stamps in this system until the kernel stamps data, s."""
 
 
 def listening() -> socket.socket:

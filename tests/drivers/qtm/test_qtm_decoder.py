@@ -157,6 +157,7 @@ def test_camera_time_is_the_clock_if_it_is_streamed() -> None:
 
 
 def test_without_camera_time_the_measurement_is_the_clock_and_the_setting_is_named() -> None:
+    """The device time is then the time since the start of the measurement."""
     feeder = ready(settings=xml(stamp=None))
     (got,) = feeder.frames(frame(5, TWO, THREE))
     assert got.ticks == 50_000
@@ -209,6 +210,7 @@ def test_a_loop_of_a_recording_is_a_restart() -> None:
 
 
 def test_numbers_that_stand_still_are_no_repetition() -> None:
+    """If the frame number is constant, frames are numbered by their time."""
     feeder = ready()
     got = feeder.frames(*(frame(1, us=us) for us in (10_000, 20_000, 30_000, 60_000)))
     assert [one.number for one in got] == [1, 2, 3, 6]
@@ -216,6 +218,7 @@ def test_numbers_that_stand_still_are_no_repetition() -> None:
 
 
 def test_losses_are_counted_in_units_of_the_usual_step() -> None:
+    """Here, the frame number usually increases by two."""
     feeder = ready()
     feeder.frames(*(frame(n) for n in (2, 4, 6, 8, 14, 16)))
     assert feeder.texts("gap") == ["2 frames lost"]
@@ -232,6 +235,7 @@ def test_a_frame_in_several_datagrams_is_one_frame() -> None:
 
 
 def test_a_part_that_is_lost_costs_only_its_content() -> None:
+    """QTM may send the parts of a frame in separate datagrams."""
     feeder = ready()
     assert feeder.frames(frame(1, TWO), frame(1, camera_time(5))) == []
     one, two = feeder.frames(frame(2))
@@ -281,6 +285,7 @@ def test_damaged_frames_never_raise(data: st.DataObject) -> None:
 
 
 def test_items_of_every_kind_are_bound_only_by_their_own_component() -> None:
+    """Unlabeled markers do not appear as labeled markers."""
     feeder = QtmFeeder()
     feeder(qtm.SettingsReply(xml(labels=(), bodies=())))
     other = qtm.ItemsComponent(ComponentType.UNLABELED, 0, 0, ((1.0, 2.0, 3.0, 7),))

@@ -60,6 +60,7 @@ async def test_a_server_without_a_known_version_is_refused() -> None:
 
 
 async def test_an_eleventh_client_is_lost_and_not_misconfigured() -> None:
+    """QTM accepts at most ten clients. The driver retries, because another client may end."""
     server = made(most_clients=0)
     async with served(server, sends=False):
         error = await refusal(server.command_port)
@@ -68,6 +69,7 @@ async def test_an_eleventh_client_is_lost_and_not_misconfigured() -> None:
 
 
 async def test_the_big_endian_port_is_recognized() -> None:
+    """QTM has a port for big-endian clients. The error names the other port."""
     greeting = b"QTM RT Interface connected\0"
     server = TextServer(struct.pack(">II", 8 + len(greeting), 1) + greeting)
     task = asyncio.create_task(server.run())

@@ -50,7 +50,7 @@ NODE: dict[str, Any] = {
 
 
 def turning(number: int) -> Quaternion:
-    """Return the orientation of reading `number`: two seconds of rest, then oscillation about x."""
+    """Return the true orientation at reading `number`: rest for 2 s, then oscillation about x."""
     roll = 0.6 * math.sin(2.0 * max(number - 200, 0) * 0.01)
     return (math.cos(roll / 2), math.sin(roll / 2), 0.0, 0.0)
 
@@ -135,6 +135,7 @@ def test_readings_of_one_instant_and_saturated_ones_are_noticed() -> None:
 
 
 def test_raw_readings_without_time_need_it_on_a_serial_port() -> None:
+    """On a serial port, a table of raw readings must have a time field."""
     fields = {name: keys for name, keys in CSV["fields"].items() if name != "time"}
     with pytest.raises(ValueError, match=r"send micros\(\) or millis\(\) with each sample"):
         serial_settings("/dev/ttyUSB0", CSV | {"fields": fields})

@@ -74,6 +74,7 @@ def test_losses_are_counted_across_wraps_of_a_short_counter() -> None:
 
 @pytest.mark.parametrize("kind", ["counter", "time"])
 def test_losses_are_counted_with_one_of_the_two(kind: str) -> None:
+    """Losses are counted with the counter alone, and with the time alone."""
     left = 14 if kind == "counter" else 13
     slots = tuple(slot for slot in SLOTS if slot != (27 - left))
     form = FORM._replace(slots=slots, tick_clock=FORM.tick_clock if left == 13 else None)

@@ -393,6 +393,7 @@ def test_signals_of_different_pages_in_one_frame_are_named(tmp_path: Path) -> No
 
 
 def test_first_bytes_and_pages_of_pages_select_the_frames_that_match_all(tmp_path: Path) -> None:
+    """A frame must match the first bytes and all multiplexers of its signals."""
     pytest.importorskip("vqf")
     pytest.importorskip("cantools")
     (tmp_path / "pages.dbc").write_text(PAGES.format(page="0|4@1+"))
@@ -437,6 +438,7 @@ def test_values_that_a_multiplexer_cannot_have_are_named(
 
 
 def test_pages_of_a_page_are_found_by_both_multiplexers(tmp_path: Path) -> None:
+    """A nested multiplexer selects the content of a page again."""
     pytest.importorskip("cantools")
     (tmp_path / "pages.dbc").write_text(PAGES.format(page="0|4@1+"))
     q0, q1 = read_signals(str(tmp_path / "pages.dbc"), ["Q0", "Q1"])

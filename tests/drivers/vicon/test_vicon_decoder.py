@@ -92,6 +92,7 @@ def test_unknown_ids_and_improper_rotations_are_counted() -> None:
 
 
 def test_light_segments_are_chained_from_the_root() -> None:
+    """The pose of a light segment is relative to its parent segment."""
     chain = tuple(
         vicon.SegmentInfo(n - 1, n, name) for n, name in enumerate(("Hip", "Thigh", "Shank"), 1)
     )
@@ -113,6 +114,7 @@ def test_light_segments_are_chained_from_the_root() -> None:
 
 
 def test_a_loop_of_parents_ends() -> None:
+    """Two segments that are parents of each other have no pose."""
     chain = (vicon.SegmentInfo(2, 1, "A"), vicon.SegmentInfo(1, 2, "B"))
     feeder = ready(vicon.StreamInfo(PERIOD), vicon.SubjectInfo(1, "Anna", chain, ()))
     local = tuple(vicon.LightSegment(n, 0.0, 0, 0, 0, 0, 0) for n in (1, 2))
@@ -131,6 +133,7 @@ def test_a_packet_without_static_objects_leaves_the_subjects() -> None:
 
 
 def test_static_types_that_are_neither_present_nor_unchanged_are_cleared() -> None:
+    """A packet lists the types of static objects that are unchanged."""
     feeder = ready()
     feeder(vicon.encode(vicon.StreamInfo(PERIOD), vicon.Contents((), frozenset())))
     (got,) = feeder.frames(frame(1))
@@ -157,6 +160,7 @@ def test_poses_that_are_listed_as_unchanged_stay() -> None:
 
 
 def test_device_time_is_the_frame_of_the_cameras() -> None:
+    """The device time is the frame number of the cameras times the frame period."""
     feeder = ready()
     one, two = feeder.frames(frame(0, hardware=5000), frame(1, hardware=5002))
     assert feeder.decoder.tick_clock is not None

@@ -89,6 +89,7 @@ def test_a_body_without_a_report_is_absent_and_delays_no_frame_for_long() -> Non
 
 
 def test_bodies_hidden_in_turns_are_not_merged() -> None:
+    """Two bodies that are visible alternately are in separate frames."""
     feeder = Feeder()
     feeder.play(range(10), 1, 2)
     turns = [frame for n in range(10, 20) for frame in feeder.play(range(n, n + 1), 1 + n % 2)]

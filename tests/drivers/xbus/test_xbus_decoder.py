@@ -121,6 +121,7 @@ def test_incomplete_message_is_dropped_after_a_silence() -> None:
 
 
 def test_a_stalled_host_is_no_silent_line() -> None:
+    """The rest of a message is accepted although the host reads it 200 ms late."""
     events, wire = XbusDecoder(921_600, 100.0), message(1, 100)
     events.feed(Chunk(0, wire[:20]))
     assert len(samples(events.feed(Chunk(200_000_000, wire[20:])))) == 1
@@ -133,6 +134,7 @@ def test_lost_messages_are_a_gap_with_their_number() -> None:
 
 
 def test_messages_without_an_orientation_take_counters_and_no_time() -> None:
+    """They increase the packet counter, and their time is that of another clock."""
     events = fed(
         decoder(), message(1, 100), message(2, 99_000, None), message(3, 200),
         message(4, 3, None), message(6, 300),
@@ -151,6 +153,7 @@ def test_the_counter_wraps() -> None:
 def test_clock_wraps_at_the_limit_of_the_model_or_at_the_observed_one(
     product: str | None, modulus: int | None
 ) -> None:
+    """Depending on the model, the clock wraps at 2^32 ticks or after 24 hours."""
     for turn in (2**32, 864_000_000) if modulus is None else (modulus,):
         events = decoder()
         if product is not None:
@@ -170,6 +173,7 @@ def test_time_that_falls_is_a_restart_and_no_gap() -> None:
 
 
 def test_stale_messages_before_fresh_ones_are_a_gap_in_the_same_clock() -> None:
+    """Counter and time have advanced by the same number of samples."""
     events = fed(decoder(), message(10, 1_000), message(11, 1_100), message(6_011, 601_100))
     assert told(events) == [("gap", {"lost": 5999})]
 
@@ -202,7 +206,7 @@ def test_any_losses_are_counted_exactly(counter: int, ticks: int, losses: list[i
 
 
 @given(st.integers(0, 10_000), st.integers(13_000, 2**31))
-@example(0, 830_562_750)  # 56 minutes before the device's midnight, for which no time has passed
+@example(0, 830_562_750)  # 56 minutes before a day clock wraps, but no time has passed
 def test_clock_reset_is_a_restart_after_a_second_message(after: int, before: int) -> None:
     follow = XbusContinuity(100.0)
     ticks = (before - 100, before, after, after + 100)

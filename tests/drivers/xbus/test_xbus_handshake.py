@@ -106,6 +106,7 @@ async def test_a_difference_is_named_and_not_written_without_permission(tmp_path
 
 
 async def test_a_rate_alone_is_offered_as_the_setting_it_takes(tmp_path: Path) -> None:
+    """If only the rate differs, the error contains the rate of the device as the remedy."""
     device = XbusDevice(tmp_path / "imu")
     async with serving(device):
         said = await refusal(make(tmp_path, rate_hz=200), DeviceMisconfiguredError)
@@ -236,14 +237,16 @@ async def test_device_that_restarts_at_every_request_is_configured(tmp_path: Pat
 
 
 async def test_a_late_answer_of_a_port_without_a_speed_is_no_other_speed(tmp_path: Path) -> None:
-    class Late(XbusDevice):  # over USB, which accepts any speed
+    """The answer arrives while the driver tries another speed, but the speed is not the cause."""
+
+    class Late(XbusDevice):  # a device on USB, which answers at any configured speed
         awake_s: float | None = None
 
         @override
         def _answer(self, message: XbusMessage) -> None:
             loop = asyncio.get_running_loop()
             if self.awake_s is None:
-                self.awake_s = loop.time() + 3.6  # between last attempt and next speed
+                self.awake_s = loop.time() + 3.6  # after the last attempt at this speed
             loop.call_at(self.awake_s, super()._answer, message)
 
     device = Late(tmp_path / "imu")

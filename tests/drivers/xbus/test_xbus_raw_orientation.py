@@ -1,4 +1,4 @@
-"""Raw readings of an Xbus device yield the orientation that the filter package computes."""
+"""Raw readings of an Xbus device yield the orientation that the package `vqf` computes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 vqf = pytest.importorskip("vqf")
 STILL = (0.0, 0.0, 0.0)
 UP = (0.0, 0.0, 9.81)
-TICKS = 100  # per sample at 100 Hz
+TICKS = 100  # ticks of the device clock per sample at 100 Hz
 
 
 def setup(rate_hz: int = 100, **more: Any) -> XbusSettings:
@@ -106,7 +106,7 @@ def test_the_interval_is_that_of_the_device_clock_and_not_the_nominal_one() -> N
 
 
 def test_ticks_too_coarse_for_one_interval_do_not_change_the_rotation() -> None:
-    """At 60 Hz, an interval has 166.67 ticks; the first interval alone has an error of 0.4 %."""
+    """At 60 Hz, an interval is 166.67 ticks. Rounding a single interval gives an error of 0.4 %."""
     orientation = GatewayOrientation(60.0, magnetometer=False, settle_s=0.0)
     turned, before = 0.0, None
     for k in range(1201):
@@ -199,7 +199,7 @@ def test_a_filter_at_rest_settles_sooner() -> None:
 def test_heading_after_a_start_in_fast_motion_is_settled_with_the_inclination(
     shared_data: Path,
 ) -> None:
-    """The RMS error of the first second of output is small in 24 starts at 579 °/s RMS."""
+    """The filter starts 24 times during rotation at 579 °/s RMS. Its first second is correct."""
     with np.load(shared_data / "broad_excerpts" / "07_undisturbed_fast_rotation_B_60s.npz") as file:
         felt = [file[f"imu_{kind}"].astype(float).tolist() for kind in ("gyr", "acc", "mag")]
         optical = file["opt_quat"].astype(float)
@@ -215,7 +215,7 @@ def test_heading_after_a_start_in_fast_motion_is_settled_with_the_inclination(
         }
         off = rotation.angle_between(np.array([*found.values()]), optical[list(found)])
         errors.append(np.degrees(np.sqrt(np.mean(off**2))))
-    assert max(errors) < 6.0  # 7.1° if the field is used from the start on
+    assert max(errors) < 6.0  # with a filter that uses the field from its start on, 7.1°
 
 
 def delayed_fields(delay_s: float, amplitude: float) -> tuple[np.ndarray, ...]:
@@ -265,7 +265,7 @@ def test_after_a_long_gap_in_fast_motion_the_sensor_is_silent_till_it_has_settle
 
 
 def test_a_fast_rate_that_repeats_itself_is_at_the_end_of_its_range() -> None:
-    """The repeated rate is detected without a status word. Slow rates may repeat."""
+    """A fast rate that repeats is saturated, even without a status word. Slow rates may repeat."""
     fast = [(7.85398, 0.0, 0.0)] * 3 + [(7.0 + 0.01 * k, 0.1, 0.2) for k in range(30)]
     slow = [(1.0, 0.0, 0.0)] * 30
     for rates, expected in ((fast, 1), (slow, 0), (fast[3:], 0)):
@@ -289,7 +289,7 @@ def test_every_precision_of_raw_items_is_understood(precision: Precision) -> Non
 
 
 def test_sample_of_the_raw_filter_has_acceleration_and_field_but_no_mean_rate() -> None:
-    """With rates that are half a period old, the error of fast motion is four times larger."""
+    """The mean rate is half a period old. Its use multiplies the error of fast motion by four."""
     bias = (0.01, -0.02, 0.005)
     items = ((Item.RATE_OF_TURN, bias), (Item.ACCELERATION, UP), (Item.MAGNETIC_FIELD, (1.0, 0, 0)))
     found = samples(decoded([message(k, 100 * k, *items) for k in range(1500)], magnetometer=True))
@@ -387,6 +387,7 @@ def test_a_magnetometer_without_a_filter_is_refused() -> None:
 
 
 def test_only_the_filter_module_imports_the_package() -> None:
+    """The module of the driver does not import `vqf`, which is optional."""
     module = importlib.import_module("jointfit_drivers.xbus._driver")
     assert "vqf" not in vars(module)
 

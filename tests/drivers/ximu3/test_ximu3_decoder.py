@@ -330,7 +330,7 @@ def test_errors_and_a_low_battery_are_reported() -> None:
 
 
 def test_raw_messages_give_the_orientation_with_magnetic_heading() -> None:
-    """The sensor turns about the vertical; its magnetometer has a fifth of the rate."""
+    """The sensor turns about the vertical. Every fifth sample contains the magnetic field."""
     pytest.importorskip("vqf")
     subject = decoder(orientation="gateway", magnetometer=True)
     wires, rate = [], 30.0  # deg/s

@@ -103,6 +103,7 @@ async def test_differences_are_named_and_not_written_without_permission(tmp_path
 
 
 async def test_a_rate_alone_is_offered_as_the_setting_it_takes(tmp_path: Path) -> None:
+    """If only the rate differs, the error contains the rate of the device as a remedy."""
     async with serving(device(tmp_path, {"ahrs_message_rate_divisor": 8})):
         assert "(or set rate_hz = 50)" in await refusal(make(tmp_path))
 
@@ -137,6 +138,7 @@ async def test_raw_outputs_are_required_where_the_gateway_computes_the_orientati
 
 
 async def test_the_serial_interface_of_a_new_device_is_dead(tmp_path: Path) -> None:
+    """A new device has serial_mode = 0, so its serial interface is off."""
     async with serving(device(tmp_path, {"serial_mode": 0}), feeding=True):
         text = await refusal(make(tmp_path), DeviceLostError)
     assert "silent" in text

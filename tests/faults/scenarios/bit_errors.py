@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 async def run(gateway: Gateway) -> Outcome:
-    """Corrupt messages of S1 for two seconds."""
+    """Corrupt messages of S1 until the daemon counts a corrupt one, and two seconds more."""
     sensor, since = gateway.sensors["S1"], len(gateway.listener.poses)
     before, sent = (await gateway.health())["devices"]["S1"], sensor.device.sent
     sensor.corrupted_share = 0.1

@@ -1,4 +1,4 @@
-"""The broker stops reading but keeps its connections."""
+"""The broker stops reading, but its connections remain open."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def resident_bytes(pid: int) -> int:
 
 
 async def run(gateway: Gateway) -> Outcome:
-    """Freeze the broker until the daemon notices it."""
+    """Freeze the broker until the daemon detects the loss of the connection."""
     memory = resident_bytes(gateway.pid)
     gateway.broker.freeze()
     try:

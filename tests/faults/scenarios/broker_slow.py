@@ -17,7 +17,7 @@ SLOW_BYTES_PER_S = 8_000
 
 
 async def run(gateway: Gateway) -> Outcome:
-    """Limit the rate of the connection for six seconds."""
+    """Limit the rate until the daemon drops a message, and six seconds more."""
     memory = resident_bytes(gateway.pid)
     async with faulty_link(gateway) as link:
         before = (await gateway.health())["link"]

@@ -1,4 +1,4 @@
-"""The camera software moves to another computer, and rig.toml follows."""
+"""The camera software moves to another computer, and the user corrects rig.toml."""
 
 from __future__ import annotations
 

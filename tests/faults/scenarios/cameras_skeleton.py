@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 async def run(gateway: Gateway) -> Outcome:
-    """Describe a skeleton for two seconds."""
+    """Describe a skeleton until the daemon reports it, and a second more."""
     since, cameras = len(gateway.listener.poses), gateway.cameras
     gateway.listener.events.clear()
     cameras.server.skeleton = True

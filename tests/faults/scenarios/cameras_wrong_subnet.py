@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 async def run(gateway: Gateway) -> Outcome:
-    """Name an address for documentation in rig.toml; reload, correct it, reload."""
+    """Write an address into rig.toml that no host has (RFC 5737); reload, correct it, reload."""
     since, text = len(gateway.listener.poses), gateway.rig.read_text("utf-8")
     wrong = text.replace('server = "127.0.0.1"', 'server = "192.0.2.77"\ninterface = "127.0.0.1"')
     gateway.rig.write_text(wrong, "utf-8")

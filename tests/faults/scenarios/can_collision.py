@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 async def run(gateway: Gateway) -> Outcome:
-    """Send from the second sensor for two seconds."""
+    """Send from the second sensor until the daemon reports it, and a second more."""
     since = len(gateway.listener.poses)
     twin = XcdiDevice(gateway.can.bus, XcdiDeviceOptions(first_counter=31_000, first_tick=31_000))
     gateway.listener.events.clear()

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from tests.faults.gateway import Gateway
 
 FRAMES_HZ = 3700
-"""Rate of frames with eight bytes at 500 kbit/s and full load."""
+"""Number of frames with eight data bytes that fill a bus of 500 kbit/s, frames/s."""
 STRANGERS = (0x000, 0x010, 0x123, 0x456, 0x7FF, 0x18FF1234)
 """Identifiers that no sensor uses."""
 

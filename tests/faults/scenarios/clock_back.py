@@ -18,7 +18,7 @@ async def run(gateway: Gateway) -> Outcome:
 
 SCENARIO = Scenario(
     title="UNIX time set back by an hour",
-    reported="no report; *noticed* is the time until the stamps of poses follow",
+    reported="no report; *noticed* is the time until poses have the new UNIX time",
     continues="everything",
     counted="nothing; the figure is `lost` + `late` + `dropped` + `restarts` of one sensor",
     run=run,

@@ -17,7 +17,7 @@ async def run(gateway: Gateway) -> Outcome:
 
 
 async def step(gateway: Gateway, seconds: float) -> Outcome:
-    """Step UNIX time by `seconds`, and undo the step; return the outcome."""
+    """Step UNIX time by `seconds` until poses have the new time, and undo the step."""
     since = len(gateway.listener.poses)
     before = (await gateway.health())["devices"]["S1"]
     gateway.inject(step_s=seconds)
@@ -39,7 +39,7 @@ def offset_s(gateway: Gateway) -> float:
 
 SCENARIO = Scenario(
     title="UNIX time set forward by an hour",
-    reported="no report; *noticed* is the time until the stamps of poses follow",
+    reported="no report; *noticed* is the time until poses have the new UNIX time",
     continues="everything",
     counted="nothing; the figure is `lost` + `late` + `dropped` + `restarts` of one sensor",
     run=run,

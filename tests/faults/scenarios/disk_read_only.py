@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 async def run(gateway: Gateway) -> Outcome:
-    """Remount the file system without the right to write, begin a recording, and remount it."""
+    """Make the file system read-only, request a recording, and make the file system writable."""
     since = len(gateway.listener.poses)
     await gateway.request("record", action="stop")
     remount(gateway, "ro")

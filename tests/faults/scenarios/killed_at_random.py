@@ -41,7 +41,7 @@ async def run(gateway: Gateway) -> Outcome:
 
 SCENARIO = Scenario(
     title="SIGKILL at a random moment of a calibration",
-    reported="`bridge/state`",
+    reported="`bridge/state`; *noticed* is the time to the exit",
     continues="nothing",
     counted="the calibration in progress; stored ones remain readable",
     run=run,

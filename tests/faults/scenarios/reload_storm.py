@@ -1,4 +1,4 @@
-"""rig.toml is loaded again and again, faulty every other time."""
+"""rig.toml is loaded again and again; every second time it has a fault."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 async def run(gateway: Gateway) -> Outcome:
-    """Let S1 repeat its orientation for a second."""
+    """Make S1 repeat its orientation until the daemon reports it, and half a second more."""
     sensor, since = gateway.sensors["S1"], len(gateway.listener.poses)
 
     def state() -> object:

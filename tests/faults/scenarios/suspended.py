@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 async def run(gateway: Gateway) -> Outcome:
-    """Stop the process by a signal, and continue it."""
+    """Stop the process of the daemon by a signal, and continue it after three seconds."""
     before = (await gateway.health())["devices"]["S1"]
     os.kill(gateway.pid, signal.SIGSTOP)
     await asyncio.sleep(3.0)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 async def run(gateway: Gateway) -> Outcome:
-    """Kill the worker of a static phase, and repeat the phase."""
+    """Kill the worker process that fits a static phase."""
     since = len(gateway.listener.poses)
     for worker in await gateway.start_fit():
         os.kill(worker, signal.SIGKILL)

@@ -15,7 +15,7 @@ LIMIT_BYTES = 30_000_000
 
 
 async def run(gateway: Gateway) -> Outcome:
-    """Limit the address space of the worker of a static phase."""
+    """Limit the address space of the worker process that fits a static phase."""
     since = len(gateway.listener.poses)
     for worker in await gateway.start_fit():
         resource.prlimit(worker, resource.RLIMIT_AS, (LIMIT_BYTES, LIMIT_BYTES))

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from tests.faults.gateway import Gateway
 
 END = b"\x04"
-"""Character that ends a file in line mode."""
+"""End-of-file character of a terminal in line mode."""
 
 
 async def run(gateway: Gateway) -> Outcome:

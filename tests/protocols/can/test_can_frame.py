@@ -69,6 +69,7 @@ def test_sizes_flags_and_identifiers_that_cannot_be_are_corrupt() -> None:
 
 
 def test_notes_of_the_host_keep_their_number() -> None:
+    """The host records the numbers of lost frames and of corrupt bytes in special frames."""
     for note in (host_dropped(5, 4722), host_corrupt(5, 2**40)):
         (back,) = unpack_frames(pack_frames([note]))
         assert isinstance(back, CanFrame)

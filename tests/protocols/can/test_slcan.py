@@ -92,6 +92,7 @@ def test_ranges_are_checked() -> None:
 
 
 def test_an_answer_inside_a_line_ends_it() -> None:
+    """The answer BEL ends the line t02, which is lost."""
     assert decoded([b"t02\aV1013\r\r"]) == (
         [SlcanLine("\a"), SlcanLine("V", "1013"), SlcanLine("")],
         3,

@@ -100,6 +100,7 @@ def test_pending_bytes_are_bounded(chunks: list[bytes]) -> None:
     ],
 )
 def test_a_run_has_the_reason_of_its_first_fault(wire: bytes, reason: str) -> None:
+    """A run is a sequence of corrupt bytes. It is reported once, with one reason."""
     assert decode([wire])[0] == [CorruptBytes(len(wire), reason)]
 
 
@@ -142,7 +143,7 @@ def test_no_single_flipped_bit_passes(wire: bytes, place: int, bit: int) -> None
 
 
 def test_time_is_linear_in_bytes() -> None:
-    """Every seventh byte of this stream starts a candidate of the greatest length."""
+    """Every seventh byte of this stream could start a message of the greatest length."""
     decoder = LpBusCodec()
     hostile = b"\x3a\x3a\x00\x3a\x00\x00\x04" * 3000
     for at in range(0, len(hostile), 7):

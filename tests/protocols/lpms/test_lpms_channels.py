@@ -112,6 +112,7 @@ def test_an_independent_reader_agrees(shared_data: Path, counts: tuple[int, ...]
 
 
 def test_the_two_rules_of_sequential_identifiers() -> None:
+    """The vendor's documents contain two rules for the identifiers of a node."""
     assert sequential_ids(1, spaced=False) == (0x515, 0x516, 0x517, 0x518)
     assert sequential_ids(1, spaced=True) == (0x514, 0x515, 0x516, 0x517)
     assert sequential_ids(2, spaced=True) == (0x51C, 0x51D, 0x51E, 0x51F)
@@ -144,6 +145,7 @@ def test_halves_in_the_wrong_order_give_no_quaternion() -> None:
 
 
 def test_stamps_that_decrease_by_a_clock_error_do_not_tear_a_sample() -> None:
+    """The two frames of a quaternion are combined even if the second stamp is slightly earlier."""
     decoder = codec("float32")
     (first, _), (_, rest) = halves(1, 1000), halves(1, 900)
     assert decoder.feed(first) is None

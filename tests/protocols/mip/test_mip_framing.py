@@ -96,6 +96,7 @@ def test_a_single_flipped_bit_never_passes(wire: bytes, place: int, bit: int) ->
     ],
 )
 def test_a_run_has_the_reason_of_its_first_real_fault(wire: bytes, reason: str) -> None:
+    """A run of corrupt bytes is reported once. Bytes that begin no packet are no real fault."""
     assert decode([wire])[0] == [CorruptBytes(len(wire), reason)]
 
 
@@ -233,6 +234,7 @@ def test_the_recording_has_the_counted_content(recording: bytes) -> None:
 
 
 def test_time_runs_within_a_data_set_and_back_across_sets(recording: bytes) -> None:
+    """Packets of different data sets are not sent in the order of their times."""
     times: list[tuple[int, int]] = []
     for packet in packets_in(recording):
         for descriptor, data in packet.fields:

@@ -42,6 +42,7 @@ def test_frames_join_to_samples_with_the_stamp_of_the_first() -> None:
 
 
 def test_a_lost_time_leaves_the_sample_and_a_lost_half_none() -> None:
+    """Without the time frame, a sample has no time. Without half of the quaternion, it is lost."""
     codec = CanTableCodec(HALVES)
     sent = [
         *frames(1, 0)[1:],
@@ -114,6 +115,7 @@ def test_multiplexed_frames_are_found_by_the_bits_of_the_multiplexer(
 
 
 def test_an_unknown_page_is_foreign_and_a_short_one_corrupt() -> None:
+    """A page is the content of a frame that one value of the multiplexer selects."""
     table = CanTable(
         ((0x200, False),),
         {0: TableField(2, "f", 32)},

@@ -73,6 +73,7 @@ def test_every_message_arrives_whatever_the_split(form: FrameFormat | LineFormat
 
 @pytest.mark.parametrize("form", ALL, ids=IDS)
 def test_damage_costs_few_messages_and_the_split_none(form: FrameFormat | LineFormat) -> None:
+    """The messages do not depend on the split of the damaged stream into chunks."""
     noise = random.Random(3)
     data = bytearray(b"".join(wire(form, number) for number in range(200)))
     for _ in range(10):

@@ -191,6 +191,7 @@ def test_a_single_flipped_bit_never_passes(wire: bytes, place: int, bit: int) ->
     ],
 )
 def test_a_run_has_the_reason_of_its_first_real_fault(wire: bytes, reason: str) -> None:
+    """A run of corrupt bytes is reported once. Bytes that begin no message are no real fault."""
     assert decode([wire])[0] == [CorruptBytes(len(wire), reason)]
 
 

@@ -77,8 +77,10 @@ def decoded(*pieces: bytes) -> list[VrpnContent | CorruptBytes]:
 
 
 def on_the_wire(messages: list[VrpnContent]) -> bytes:
-    """Return the bytes of `messages`. The descriptions precede the first message, and are repeated
-    after each cookie.
+    """Return the bytes of `messages`.
+
+    Descriptions of senders and types precede the first message, and are repeated after each cookie.
+    A cookie is the greeting of a new connection.
     """
     parts = [DESCRIBED]
     for message in messages:

@@ -110,6 +110,7 @@ def test_the_variant_55_61_is_recognized_and_not_decoded(size: int) -> None:
 
 @pytest.mark.parametrize("before", range(30))
 def test_the_first_start_55_61_is_not_counted_wherever_it_is(before: int) -> None:
+    """A single sequence 55 61 can be noise."""
     _, codec = decode([bytes(before) + b"\x55\x61" + bytes(18)])
     assert codec.other_frames == 0
 

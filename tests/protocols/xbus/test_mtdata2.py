@@ -184,6 +184,7 @@ def test_unknown_items_are_kept_by_size(items: list[tuple[int, bytes]]) -> None:
 def test_a_run_that_does_not_end_exactly_is_refused(
     items: list[tuple[int, bytes]], data: st.DataObject
 ) -> None:
+    """A run is the sequence of items in a message."""
     wire = mtdata2.encode_items(items)
     lengths = [3 + len(raw) for _, raw in items]
     ends = {sum(lengths[:count]) for count in range(len(items) + 1)}
@@ -193,11 +194,13 @@ def test_a_run_that_does_not_end_exactly_is_refused(
 
 @given(st.floats(-2047, 2047))
 def test_12_20_is_an_integer_over_2_to_the_20(number: float) -> None:
+    """The format 12.20 is a fixed-point number with 20 bits after the point."""
     raw = mtdata2.encode_reals(Precision.FIXED_12_20, [number])
     assert struct.unpack(">i", raw)[0] == round(number * 2**20)
 
 
 def test_16_32_holds_its_fraction_before_its_whole_part() -> None:
+    """The format 16.32 is a fixed-point number with 32 bits after the point."""
     raw = mtdata2.encode_reals(Precision.FIXED_16_32, [-0.5, 3.25])
     assert raw.hex() == "80000000ffff" + "400000000003"
 
@@ -278,6 +281,7 @@ def test_the_matrix_sent_is_the_rotation_of_the_quaternion_column_by_column(
 
 
 def test_free_acceleration_is_acceleration_without_gravity_in_the_world(shared_data: Path) -> None:
+    """The quaternions that rotate accelerations to the world have norm 1."""
     norms = [
         math.hypot(*value(items, Item.QUATERNION))
         for items in messages(shared_data, "5")

@@ -93,6 +93,7 @@ def test_pending_bytes_are_bounded(chunks: list[bytes]) -> None:
     ],
 )
 def test_a_run_is_named_for_its_first_real_fault(wire: bytes, reason: str) -> None:
+    """A run of corrupt bytes is reported once. Bytes that begin no message are no real fault."""
     assert decode([wire])[0] == [CorruptBytes(len(wire), reason)]
 
 

@@ -136,6 +136,7 @@ def changed(place: int, byte: int) -> bytes:
 )
 @pytest.mark.parametrize("before", [0, 1, 70, 140])
 def test_a_run_of_messages_equals_single_ones_up_to_another_line(before: int, other: bytes) -> None:
+    """Messages with the same layout are decoded together, with the result of single decoding."""
     values = (0.5, -0.5, 0.5, -0.5)
     run = [encode_data("Q", 1_000_000 + 3 * number, values) for number in range(before + 40)]
     lines = [*run[:before], other, *run[before:]]
