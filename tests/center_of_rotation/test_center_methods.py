@@ -195,6 +195,7 @@ def test_no_method_returns_nan_without_a_refusal(seed: int, hidden: float, name:
 
 @pytest.mark.parametrize("arc", [20.0, 45.0, 90.0])
 def test_the_batch_spheres_ellipse_covers(arc: float) -> None:
+    """The 95 % ellipsoid contains the true center in at least 70 of 80 movements."""
     rng = np.random.default_rng(3)
     held = 0
     for _ in range(80):

@@ -127,6 +127,7 @@ def test_joint_rotations_and_payload_use_the_segment_that_carries_the_joint(
 
 
 def test_order_of_a_line_is_that_of_its_lists() -> None:
+    """In a limb without branches, joints and segments have the order of their lists."""
     assert [joint[1:] for joint in inner_joints(LINE)] == [("knee", 0, 1)]
     assert joint_parts(LINE) == [(0, 1), (1, 2), (2, 3)]
     assert branch_runs(LINE) == [[0, 1, 2]]

@@ -1,7 +1,7 @@
-"""The procedure of the patent: exactly the steps S2 to S7.
+"""The procedure of patent CN 114533039 B: exactly the steps S2 to S7.
 
-The expected values are the equations of the patent, evaluated with NumPy and SciPy from the raw
-sensors.
+The expected values are the equations of the patent, evaluated with NumPy and SciPy from the
+orientations that the sensors measured.
 """
 
 from __future__ import annotations
@@ -106,7 +106,10 @@ def rotations(q: Array) -> Rotation:
 
 @cache
 def bias(sensor: str) -> Array:
-    """Return the mean over the static pose of q_bias in q_s (x) q_bias = (1, 0, 0, 0), step S2."""
+    """Return q_bias of step S2, averaged over the static pose.
+
+    q_bias satisfies q_s (x) q_bias = (1, 0, 0, 0), with the measured orientation q_s of the sensor.
+    """
     tracks = record(SUBJECT, motion(SUBJECT, 6.0, 400.0, still=True), 1).sensors
     found = []
     for w, x, y, z in tracks[sensor].q_world_sensor:
@@ -117,7 +120,7 @@ def bias(sensor: str) -> Array:
 
 
 def steps(used: Calibration, frames: Frames) -> list[Rotation]:
-    """Return the segment orientations q_o1 and q_o2 of every frame by steps S3 and S4."""
+    """Return the orientations of thigh and shank in every frame by steps S3 and S4."""
     out = []
     for segment, sensors in zip(CHAIN.segments, CHAIN.sensors, strict=True):
         table = used.quality["regression"][segment]

@@ -119,6 +119,7 @@ def test_adduction_brings_a_right_foot_to_the_midline_and_toes_turn_in() -> None
 
 @pytest.mark.parametrize("left", [False, True])
 def test_one_frame_reads_as_the_arrays_do(left: bool) -> None:
+    """The function for one frame returns the angles of the function for arrays."""
     proximal, distal = random_rotations(300, 1), random_rotations(300, 2)
     q = joint_rotation(proximal, distal)
     expected = anatomical(grood_suntay(q).angles, flexion_sign=-1.0, left=left)
@@ -131,6 +132,7 @@ def test_one_frame_reads_as_the_arrays_do(left: bool) -> None:
 
 
 def test_one_frame_reads_the_patents_angles_as_the_arrays_do() -> None:
+    """The function for one frame returns the angles of the function for arrays."""
     proximal = random_rotations(300, 1)
     turns = np.vstack((random_rotations(297, 2), from_sequence("ZYX", LOCKED)))
     distal = rot.multiply(proximal, turns)

@@ -50,7 +50,8 @@ def test_a_cluster_of_hundreds_of_markers_is_searched_and_fits() -> None:
     upright = np.array((1.0, 0.0, 0.0, 0.0))
     cluster = MarkerCluster("thigh", names, None, points, np.zeros(3), upright)
     finding = LabelSearch([cluster]).explain(points)
-    # The error is a difference of squares, so it is exact to the root of their rounding only.
+    # The error is the root of a difference of squares, so its accuracy is only the root of their
+    # rounding error.
     assert finding.rms[0] < 4.0 * np.sqrt(np.finfo(float).eps * np.mean(points**2))
     assert finding.faults == ()
 
@@ -73,6 +74,7 @@ def test_an_exchange_is_named_in_most_frames_and_hardly_ever_another_one(
 def test_a_search_spread_over_frames_finds_the_same_with_one_cluster_a_frame(
     labels: tuple[str, ...],
 ) -> None:
+    """A search that evaluates one cluster per frame finds the faults of a whole search."""
     clusters, _, positions = person(2, skin_m=0.006, occluded=0.02)
     search = LabelSearch(clusters, centers_of(clusters))
     for points in cycled(positions[::240], *labels):
@@ -134,7 +136,8 @@ def test_soft_tissue_artefact_and_occlusions_are_no_exchange(seed: int) -> None:
     "labels", [("thigh0", "thigh1"), ("thigh1", "thigh3"), ("thigh0", "thigh2")]
 )
 def test_joint_centers_reveal_an_exchange_on_a_rectangular_plate(labels: tuple[str, str]) -> None:
-    # Two opposite markers exchange as well as the other two, and three fit in two ways.
+    # An exchange of two corners of a rectangle yields the same shape as an exchange of the other
+    # two corners. The shape alone therefore does not show which labels are wrong.
     clusters, _, positions = person(2)
     rows = [LABELS.index(f"thigh{k}") for k in range(4)]
     corners = np.array([[0.06, 0, 0.03], [0.06, 0, -0.03], [-0.06, 0, -0.03], [-0.06, 0, 0.03]])

@@ -1,4 +1,4 @@
-"""Mixture of the corrections of both experts and the trend, by leverage ratio."""
+"""Correction of a frame: a mixture of two regressions (experts) and a trend, by leverage ratio."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ class TurnedSensor:
 
 
 def turned_source(direction: str = "sensor_to_world") -> Source:
-    """Return the sensor S1 of a rig with this setting."""
+    """Return the sensor S1 of a rig with the setting `direction`."""
     settings = TurnedSettings.model_validate({"direction": direction})
     return cast("Source", SimpleNamespace(id="S1", driver_class=TurnedSensor, settings=settings))
 

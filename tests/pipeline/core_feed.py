@@ -1,4 +1,4 @@
-"""Bytes with simulated arrival times for the core: two Xbus and two XCDI sensors, mocap."""
+"""Bytes with simulated arrival times for the core: two Xbus and two XCDI sensors, cameras."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def table(**head: Any) -> dict[str, Any]:
 
 
 def orientation(name: str, number: int) -> tuple[float, float, float, float]:
-    """Return the orientation of a sensor, which rotates about its own axis by at most 60 deg/s."""
+    """Return the orientation of a sensor that swings about a fixed axis at up to 115 deg/s."""
     half = 0.5 * math.sin(0.02 * number + len(name) + ord(name[-1]))
     axis = [0.0, 0.0, 0.0]
     axis[ord(name[-1]) % 3] = math.sin(half)

@@ -115,7 +115,7 @@ def test_no_sample_is_pending_after_all_sources_closed() -> None:
 
 @cache
 def waited(missing: frozenset[tuple[str, int]], count: int = SETTLED + 30) -> dict[int, int]:
-    """Return the output time of each frame, by its time, ns, if some samples are missing."""
+    """Return the output time of each frame by frame time, ns, without the samples in `missing`."""
     bench = Bench()
     samples = [chunk(s, n) for s in SENSORS for n in range(count) if (s, n) not in missing]
     bench.feed(opening(mocap=False))
@@ -142,7 +142,7 @@ def test_missing_samples_delay_a_frame_by_one_and_a_half_periods_at_most(
 
 
 def test_missing_sample_delays_its_frame() -> None:
-    """The aligner waits for missing samples; otherwise the other test would be meaningless."""
+    """The aligner waits for a missing sample. The limit in the test above concerns this wait."""
     whole, holed = waited(frozenset()), waited(frozenset({("S4", SETTLED + 5)}))
     delays = [holed[t_ns] - whole[t_ns] for t_ns in whole if t_ns in holed]
     assert max(delays) > 0.5 * PERIOD_NS

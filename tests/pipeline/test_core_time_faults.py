@@ -119,7 +119,7 @@ class Lived:
     fault_ns: int
 
     def between(self, begin_ns: int, end_ns: int) -> list[tuple[str, AlignedFrame]]:
-        """Return sync states and frames that were output in this interval after the fault."""
+        """Return sync states and frames of an output interval, in time since the fault."""
         return [
             (state.sync, frame)
             for state, frame in zip(self.states, self.frames, strict=True)
@@ -189,7 +189,7 @@ def assert_healed(run: Lived, after_ns: int = RECOVERY_NS) -> None:
 
 
 def told(run: Lived, name: str) -> list[str]:
-    """Return the notices about a clock after the fault."""
+    """Return the texts of the notices about the clock of the sensor `name`."""
     return [n.text for n in run.notices if n.kind == "clock" and n.id == name]
 
 
@@ -327,7 +327,7 @@ def test_counter_jump_without_device_clock_is_reported_and_settles_again(jump: i
     assert run.sync_with("S4", 100 * MS, 1_500 * MS) == {"settling"}
 
 
-# --- any mixture of it --------------------------------------------------------------------------
+# --- any mixture of these faults ----------------------------------------------------------------
 
 
 FAULTS: dict[str, Callable[[Sent, int], Sent | None]] = {}

@@ -165,9 +165,9 @@ def test_wrong_unix_time_moves_no_stamp_and_is_used_again_when_corrected(
     rig.stream(6)
     assert rig.state() == "passive"
     rig.set_unix_time(UNIX_NS)
-    rig.stream(16)  # the error of passive time is slewed away
+    rig.stream(16)  # meanwhile, slewing removes the error of the passive time
     assert rig.state() == "direct"
-    assert max(map(abs, rig.errors_ms(30))) < 4.1  # the delay is 6 ms, its prior 10 ms
+    assert max(map(abs, rig.errors_ms(30))) < 4.1  # the delay is 6 ms, assumed 10 ms
     assert rig.errors_ms(rig.number - 10) == [0.0] * 10
     stamps = [t_ns for _, t_ns, _, _ in rig.core.frames]
     assert all(b > a for a, b in itertools.pairwise(stamps))

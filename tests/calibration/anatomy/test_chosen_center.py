@@ -104,7 +104,7 @@ def test_three_frames_of_a_live_track_weight_their_noise_by_the_residuals_of_the
     plain = predicted_variance(None)
     assert predicted_variance(np.full_like(shank.points[..., 0], 3e-4)) == pytest.approx(plain)
     assert predicted_variance(np.where(used, 2e-4, 6e-4)) < 0.8 * plain
-    # the centers of the four markers differ, so small residuals do not reduce the variance
+    # here the used frames have the larger residuals, so the variance does not decrease
     assert predicted_variance(np.where(used, 6e-4, 2e-4)) > 0.99 * plain
 
 
@@ -136,6 +136,7 @@ def test_a_hip_moved_about_two_axes_is_refused_by_estimators_of_one_axis(
 
 
 def test_a_hip_moved_about_two_axes_is_a_point_of_both_bodies() -> None:
+    """SCoRE finds a center, and no axis, if the hip moves about two axes."""
     found = center_of("hip", "score")
     assert found.fit is not None
     assert found.fit.axis is None

@@ -1,4 +1,4 @@
-"""Progress of a functional movement: arcs and flexions, including the loss of a sensor."""
+"""Progress of a functional movement: arcs, flexions, and the effect of a lost sensor."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_a_sensor_that_takes_over_for_a_lost_one_adds_no_arc() -> None:
     progress = MovementProgress(CHAIN)
     progress.update({"S1": UPRIGHT, "S2": about_x(90), "S3": UPRIGHT})
     progress.update({"S1": UPRIGHT, "S2": about_x(90), "S3": about_x(10)})
-    # S2 replaces S1, which has another mount. The joint does not move.
+    # S2 replaces S1, and has another sensor-to-segment alignment. The joint does not move.
     progress.update({"S2": about_x(90), "S3": about_x(10)})
     assert math.degrees(progress.arcs()["knee"]) == pytest.approx(10.0)
 

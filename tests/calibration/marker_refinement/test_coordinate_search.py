@@ -44,6 +44,7 @@ def test_a_locked_coordinate_stays(goal: np.ndarray) -> None:
 
 
 def test_a_step_is_kept_while_it_helps_and_halved_only_when_neither_way_does() -> None:
+    """The step is halved only if neither direction reduces the error."""
     asked: list[float] = []
 
     def error(positions: np.ndarray) -> float:

@@ -181,6 +181,7 @@ def test_gauge_freedom_is_counted_and_named() -> None:
 
 
 def test_a_gauge_of_known_matrices() -> None:
+    """A zero eigenvalue is a free direction, and a small eigenvalue a weak direction."""
     S = 10.0 * np.diag([0.0, 0.005, 1.0])
     gauge = gauge_of(S, 10, ["a", "b", "c"], prior=0.0)
     assert (gauge.free, gauge.weak, gauge.involved) == (1, 1, ("a",))

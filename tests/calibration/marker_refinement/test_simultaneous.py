@@ -190,6 +190,7 @@ def test_with_joint_limits_markers_fit_a_program_that_clamps_its_joints() -> Non
 
 
 def test_both_methods_find_the_same_within_limits() -> None:
+    """With joint limits, both refinement methods end with the same cost."""
     trial, ends = MotionTrial("walk", seen(0.002), 100.0), []
     methods: tuple[RefinementMethod, ...] = ("joint", "block")
     for method in methods:

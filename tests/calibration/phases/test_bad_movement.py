@@ -50,7 +50,7 @@ def fit(
     still: bool = False,
     learning: bool = False,
 ) -> Calibration:
-    """Return a calibration whose movement, and with `still` also static pose, is changed."""
+    """Return a calibration from a changed movement and, with `still`, a changed static pose."""
     static, functional, alignment = trials()
     pose = change(static) if still else static
     settings = LEARNING if learning else QUICK

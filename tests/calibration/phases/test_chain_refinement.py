@@ -1,4 +1,4 @@
-"""Refinement of chain-model markers in a calibration; it is used only if it reduces errors."""
+"""Refined markers of a chain model are used in a calibration only if their errors decrease."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ def test_soft_tissue_artefact_increases_the_deviation_of_a_lag() -> None:
 
 
 def test_a_lag_smaller_than_its_deviation_is_noise_and_not_used() -> None:
-    """Recorded squats give one sensor of a pair 3.6 ± 4.7 ms, and the other sensor no lag."""
+    """In recorded squats, one sensor had a lag of 3.6 ± 4.7 ms, and its neighbor no estimate."""
     assert segment_lags({"S1": said(3.6, 4.7)}, {}) == {}
     assert set(segment_lags({"S1": said(3.6, 4.7), "S2": said(15.0, 1.0)}, {})) == {"S2"}
     with_plate = segment_lags({"S1": said(0.5, 4.7)}, {"S1": (100_000, 0.2 * MS)})
@@ -55,7 +55,7 @@ def test_sensor_with_a_plate_lag_corrects_the_soft_tissue_lag_of_its_neighbor() 
     alone = segment_lags(moving, {})["S2"]
     taught = segment_lags(moving, {"S1": (round(5 * MS), 0.1 * MS)})["S2"]
     assert alone.lag_ns == 14 * MS
-    assert 10 * MS < taught.lag_ns < 12 * MS  # S1 has a bias of 4 ms, which S2 mostly shares
+    assert 10 * MS < taught.lag_ns < 12 * MS  # S1 has a bias of 4 ms, and S2 a similar one
     assert taught.sigma_ns is not None
     assert alone.sigma_ns is not None
     assert taught.sigma_ns < alone.sigma_ns

@@ -1,4 +1,4 @@
-"""Errors of two segments that look at one joint, and what they make of its deviation."""
+"""Correlation of the errors of two segments, and the standard deviation of their joint angle."""
 
 from __future__ import annotations
 
@@ -27,7 +27,11 @@ CHAIN = Chain(("hip", "knee", "ankle"), ("thigh", "shank"), (("S1", "S2"), ("S3"
 
 
 def limb(alike: float, seed: int = 1) -> LimbTraining:
-    """Squats; about x all sensors err by slow noise no posture tells, of the correlation given."""
+    """Return squats in which all sensors of a segment have one random error about x.
+
+    The error does not depend on posture. `alike` is the correlation of the errors of thigh and
+    shank.
+    """
     rng = np.random.default_rng(seed)
     t = np.linspace(0.0, 60.0, N)
     bend = np.column_stack([0.6 - 0.6 * np.cos(t), 0.05 * np.sin(0.7 * t), 0.05 * np.sin(t)])
@@ -75,6 +79,7 @@ def test_joint_with_few_complete_frames_has_no_error_correlation() -> None:
 
 
 def test_opposite_errors_make_a_joint_less_sure_and_like_ones_surer() -> None:
+    """A joint angle is a difference of two segments, so equal errors of both segments cancel."""
     above = FusedSegment((1.0, 0.0, 0.0, 0.0), 0.05, ("S1",), (), 0.03)
     below = FusedSegment((1.0, 0.0, 0.0, 0.0), 0.05, ("S3",), (), 0.04)
 
@@ -90,7 +95,7 @@ def test_opposite_errors_make_a_joint_less_sure_and_like_ones_surer() -> None:
 
 
 def test_errors_of_held_or_inconsistent_segments_are_independent() -> None:
-    """Held orientations, plain means and doubts of a watch come from elsewhere than the models."""
+    """The correlation applies to model errors only, not to held orientations or sensor faults."""
     above = FusedSegment((1.0, 0.0, 0.0, 0.0), 0.05, ("S1",), (), 0.03)
     below = FusedSegment((1.0, 0.0, 0.0, 0.0), 0.4, (), ("held:shank",))
 
@@ -109,7 +114,7 @@ def test_errors_of_held_or_inconsistent_segments_are_independent() -> None:
 
 @pytest.mark.parametrize("rho", [1.0, -1.5, float("nan")])
 def test_a_stored_correlation_that_cannot_be_is_no_calibration(rho: float) -> None:
-    """It would make a variance of flexion negative, in the middle of a frame."""
+    """A correlation between -1 and 1 gives a positive variance of the joint angle."""
     data = calibration().to_dict()
     assert Calibration.from_dict({**data, "correlations": {"knee": -0.3}}).correlations == {
         "knee": -0.3

@@ -54,6 +54,7 @@ class Knee:
 
 
 def test_data_without_movement_leaves_the_mean_as_it_is() -> None:
+    """Without movement in the training, the correction is hardly worse than the sensor mean."""
     knee = Knee(bend=0.0)
     rng = np.random.default_rng(4)
     for i in (0, 1):
@@ -134,19 +135,21 @@ def test_the_heading_of_a_person_changes_nothing() -> None:
 
 
 def test_the_claim_grows_outside_of_the_training() -> None:
+    """The predicted standard deviation is larger outside the training range than inside."""
     model = fit_kernel(Knee().training())
     inside, outside = model.spread.at(0.5), model.spread.at(10.0)
     assert all(far > 1.4 * near for near, far in zip(inside, outside, strict=True))
 
 
 def test_errors_beyond_the_training_are_claimed_larger_than_shown() -> None:
+    """Beyond the leverage ratios of the residuals, the predicted error exceeds the residuals."""
     rng = np.random.default_rng(2)
     near = measure_spread([rng.uniform(0, 1, 900)], [rng.normal(0, 0.02, (900, 3))], np.ones(900))
     within = np.array(near.at(0.5))
     assert np.all((within > 0.014) & (within < 0.026))
     assert np.all(np.array(near.at(2.0)) > 1.5 * within)
 
-    # The prior observation is three times the RMS error at r = 1.5.
+    # At the leverage ratio r = 1.5, the fit has a prior observation of three times the RMS error.
     ratios = np.array(near.at(1.5)) / within
     assert np.all((ratios > 2.4) & (ratios < 3.0))
 
@@ -183,6 +186,7 @@ def test_long_pauses_in_the_training_hardly_change_the_error_in_movement(seed: i
 
 
 def test_stacked_shares_are_a_part_of_a_whole() -> None:
+    """Stacking weights are not negative, have a sum of at most 1, and prefer good predictions."""
     rng = np.random.default_rng(3)
     truth = rng.normal(0, 1, 200)
     predictions = np.stack([truth + rng.normal(0, 0.1, 200), rng.normal(0, 1, 200)], axis=1)
@@ -194,6 +198,7 @@ def test_stacked_shares_are_a_part_of_a_whole() -> None:
 
 
 def test_one_frame_is_that_of_many_wherever_it_lies() -> None:
+    """The prediction for one frame equals its row in the prediction for all frames."""
     knee = Knee()
     model = fit_kernel(knee.training(slice(0, 120)))
     many = model.predict(knee.sensors, knee.other)
@@ -206,7 +211,7 @@ def test_one_frame_is_that_of_many_wherever_it_lies() -> None:
 
 
 def test_constant_offset_is_corrected_far_outside_the_training_range() -> None:
-    """Sensors with a constant offset of 4 deg are corrected, also outside the training range."""
+    """Sensors with a constant offset of 5 deg are corrected, also outside the training range."""
     off = rot.exp(np.array([4.0 * DEG, -3.0 * DEG, 0.0]))
     near, far = Knee(bend=0.6), Knee(bend=2.4)
     for knee in (near, far):
@@ -220,6 +225,7 @@ def test_constant_offset_is_corrected_far_outside_the_training_range() -> None:
 
 
 def test_a_trend_of_constant_and_weights_is_found_and_bounded() -> None:
+    """The trend is a constant plus linear terms. Outliers hardly change it, and it has a limit."""
     rng = np.random.default_rng(5)
     u = rng.normal(0, 0.3, (400, 9))
     u[:, 6:] = rng.normal(0, 0.01, (400, 3))
@@ -253,7 +259,7 @@ def test_a_stored_model_with_wrong_types_is_found_wherever_they_are() -> None:
 
 
 def test_trial_with_much_upright_standing_is_fitted() -> None:
-    """If the only moving frames are left out, the remaining frames have no leverage."""
+    """The cross-validation also holds out the only moving frames; the rest has no leverage."""
     knee = Knee()
     for q in (*knee.sensors, knee.other, knee.bone):
         q[100:] = (1.0, 0.0, 0.0, 0.0)
@@ -264,7 +270,7 @@ def test_trial_with_much_upright_standing_is_fitted() -> None:
 
 
 def test_correction_is_zero_in_the_static_pose_for_any_training() -> None:
-    """The trend contains a constant, whose weight is zero in the static pose."""
+    """The constant term of the trend is not applied in the static pose."""
     knee = Knee(bend=2.0)
     off = rot.exp(np.array([4.0 * DEG, -3.0 * DEG, 0.0]))
     knee.sensors = [rot.multiply(q, off) for q in knee.sensors]

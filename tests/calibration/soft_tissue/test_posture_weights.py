@@ -46,6 +46,7 @@ def test_weight_decreases_with_the_fourth_root_of_the_number_of_equal_frames() -
 
 
 def test_disagreement_of_the_sensors_is_no_posture() -> None:
+    """Differences between the sensors (regressors 3 to 5) do not affect the weights."""
     u = rest_and_movement(2)
     other = u.copy()
     other[:, 3:6] += np.random.default_rng(3).normal(0.0, 0.5, (len(u), 3))

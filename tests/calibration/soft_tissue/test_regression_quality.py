@@ -1,4 +1,4 @@
-"""Published regression coefficients: those verified on held-out data, beside the stored ones."""
+"""Published regression coefficients: one set verified on held-out data, and the stored set."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ FIRST = slice(None, 240)
 
 
 def least_squares(movement: LimbTraining, part: slice, segment: str) -> NDArray[np.float64]:
-    """Return a, b, c of every component: a q1 + b q2 + c = q_reference, as the patent writes it."""
+    """Return a, b and c of every quaternion component by least squares, shape (4, 3).
+
+    They satisfy a q1 + b q2 + c = q_reference. q1 and q2 are the orientations of the two sensors.
+    """
     first, second = dict(zip(TWO_AND_TWO.segments, TWO_AND_TWO.sensors, strict=True))[segment]
     rows = []
     for k in range(4):

@@ -1,4 +1,4 @@
-"""Segment models on a simulated limb with soft tissue: accuracy, and single frames."""
+"""Segment models on a simulated limb with soft-tissue artefact, for arrays and single frames."""
 
 from __future__ import annotations
 
@@ -96,6 +96,7 @@ def test_mean_weights_all_sensors_equally() -> None:
 
 
 def test_the_single_is_the_sensor_that_was_nearest_in_training_bit_for_bit() -> None:
+    """The method `single` returns the orientations of the best sensor of the training."""
     limb = Limb(sensors=3)
     limb.sensors[0] = rot.multiply(limb.sensors[0], rot.exp(np.array([0.3, 0.0, 0.0])))
     errors = [float(np.mean(rot.angle_between(q, limb.segment)[:360] ** 2)) for q in limb.sensors]
@@ -125,7 +126,7 @@ def test_markley_removes_constant_rotations_and_weights_the_residuals() -> None:
 def test_corrections_beat_the_mean_on_movement_they_did_not_see() -> None:
     limb = Limb()
     mean = limb.error(limb.fit("mean"))
-    assert limb.error(limb.fit("anchored")) < 0.35 * mean  # the rest is the noise of the sensors
+    assert limb.error(limb.fit("anchored")) < 0.35 * mean  # sensor noise remains
     assert limb.error(limb.fit("patent12")) < 0.8 * mean
 
 
@@ -164,6 +165,7 @@ def test_correction_fades_outside_the_training_range_with_a_flag() -> None:
 
 
 def test_without_the_neighbor_the_anchored_model_is_the_mean() -> None:
+    """Without the orientation of the neighboring segment, the model returns the sensor mean."""
     limb = Limb()
     model = limb.fit("anchored")
     assert isinstance(model, KernelModel)
@@ -183,6 +185,7 @@ def test_predicted_deviation_matches_the_errors_of_later_frames() -> None:
 
 
 def test_axes_are_claimed_apart_and_together() -> None:
+    """The total standard deviation is the RMS of the standard deviations about the axes."""
     limb = Limb()
     model = limb.fit("anchored")
     said = model.predict_one(
@@ -193,6 +196,7 @@ def test_axes_are_claimed_apart_and_together() -> None:
 
 
 def test_model_without_information_is_the_mean() -> None:
+    """If sensor errors do not depend on posture, the model is as accurate as the sensor mean."""
     rng = np.random.default_rng(3)
     limb = Limb()
     limb.sensors = [
@@ -227,6 +231,7 @@ def test_the_patent_finds_coefficients_that_were_put_in() -> None:
 
 
 def test_a_regression_that_gives_no_rotation_leaves_the_mean() -> None:
+    """If the regression result is far from unit length, the model returns the sensor mean."""
     limb = Limb()
     fitted = limb.fit("patent12")
     assert isinstance(fitted, PatentModel)

@@ -1,4 +1,4 @@
-"""Links between sensors: expected rotation and its standard deviation by posture."""
+"""A sensor link predicts the rotation between two sensors, and its error, from the posture."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def pair_of(thigh: Array, noise: Array) -> SensorLink:
 
 @pytest.fixture(scope="module")
 def link() -> SensorLink:
-    """A pair that was trained up to 20 degrees of tilt."""
+    """Return the link of S1 and S2, trained with thigh tilts of up to 20 degrees."""
     random = np.random.default_rng(1)
     thigh = radians(20.0) * np.sin(np.linspace(0.0, 60.0, N))
     return pair_of(thigh, radians(0.5) * random.standard_normal(N))
@@ -72,6 +72,7 @@ def test_standard_deviation_of_a_link_contains_its_error_in_untrained_postures(
 
 
 def test_movement_in_which_residuals_are_alike_leaves_a_link_less_certain() -> None:
+    """Slow noise has fewer independent frames than white noise, so the prediction is worse."""
     random = np.random.default_rng(2)
     thigh = radians(20.0) * np.sin(np.linspace(0.0, 60.0, N))
     white = random.standard_normal(N)
@@ -85,6 +86,7 @@ def test_movement_in_which_residuals_are_alike_leaves_a_link_less_certain() -> N
 
 
 def test_frames_are_independent_for_regressors_that_are_not_alike() -> None:
+    """Constant residuals count as many independent frames if the regressors are white noise."""
     random = np.random.default_rng(4)
     alike = np.ones((2000, 1))
     assert independent_frames(alike, random.standard_normal((2000, 2))) > 500
@@ -98,7 +100,8 @@ def test_independent_frames_of_an_autoregressive_process_are_counted(correlation
     for k in range(1, len(white)):
         process[k] = correlation * process[k - 1] + white[k]
 
-    # n (1 - r) / (1 + r), the large-sample limit
+    # The limit for many frames is n (1 - r) / (1 + r), with n frames and the correlation r of
+    # successive frames.
     expected = len(white) * (1.0 - correlation) / (1.0 + correlation)
     constant = np.ones((len(white), 1))
     assert independent_frames(process, constant) == pytest.approx(expected, rel=0.15)

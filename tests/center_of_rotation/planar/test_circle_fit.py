@@ -121,6 +121,7 @@ def test_windowed_running_circle_equals_fit_of_last_frames(window: int) -> None:
 
 
 def test_many_circles_at_once_are_the_same_circles() -> None:
+    """Fits of many circles in one call equal the fits of the single circles."""
     sets = np.stack([swing(seed=k) for k in range(5)])
     found = fit_circles(sets, correlated=True)
     for k, p in enumerate(sets):
@@ -222,6 +223,7 @@ def test_running_circle_bears_weights_that_cancel_by_rounding() -> None:
 
 
 def test_correlated_circles_of_unseen_points_are_not_valid() -> None:
+    """The fit with `correlated=True` is not valid if all points are missing."""
     found = fit_circles(np.full((2, 9, 2), nan), correlated=True)
     assert not found.valid.any()
 
@@ -266,9 +268,10 @@ def test_arcs_are_counted_between_the_outermost_points() -> None:
 
 
 def covered(truth: float) -> tuple[float, float]:
-    """Return coverage and fraction of the published centers, for T ~ N(truth, 1).
+    """Return the coverage of published ellipses, and the fraction of centers that are published.
 
-    Both are integrated over T. The number of frames is assumed to be unlimited.
+    Both are integrals over the conditioning T, which has the normal distribution N(truth, 1). The
+    number of frames is assumed to be unlimited.
     """
     z, dz = np.linspace(-9, 9, 20_001, retstep=True)
     t = truth + z

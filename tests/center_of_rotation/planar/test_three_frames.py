@@ -199,6 +199,7 @@ def test_predicted_mean_squares_are_those_of_simulated_noise(noise: Any) -> None
 
 
 def test_both_mean_squares_add_up_to_equation_14() -> None:
+    """The mean squares of both axes add up to the corrected equation 14 of Akbarifar et al."""
     t = np.array([[0.2, 0.9, 1.7], [0.1, 2.0, 4.5]])
     total = three_frame_mean_squares(t, 0.001).sum(axis=-1)
     np.testing.assert_allclose(total, arbitrary_error(t, 0.001) ** 2, rtol=1e-12)

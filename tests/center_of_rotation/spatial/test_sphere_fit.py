@@ -38,6 +38,7 @@ def test_a_child_at_rest_in_a_noisy_parent_is_refused(name: str, noise: float) -
 
 
 def test_rotations_of_a_loose_parent_are_no_joint_rotations() -> None:
+    """Marker noise rotates the frame of a small parent cluster, although the joint is at rest."""
     believed = 0
     for seed in range(12):
         rng = np.random.default_rng(seed)
@@ -130,6 +131,7 @@ def test_fading_noise_is_not_counted_as_soft_tissue_artefact() -> None:
 @pytest.mark.parametrize("rank", [1, 2, 3])
 @pytest.mark.parametrize("freedom", [20.0, 100.0, 5000.0])
 def test_the_published_ellipse_has_the_quantile_of_its_freedom(rank: int, freedom: float) -> None:
+    """The size of the ellipse is the 95 % quantile of the F distribution, times the rank."""
     exact = rank * float(fisher.ppf(0.95, rank, freedom))
     assert within95(rank, freedom) == pytest.approx(exact, rel=0.02)
 

@@ -26,7 +26,7 @@ def study() -> dict[str, PairMaps]:
 def test_the_correlations_of_the_table_are_reproduced(
     study: dict[str, PairMaps], name: str, clip: float | None, predicted: float, grid: float
 ) -> None:
-    """The tolerances equal those of the experiment published-error-maps, with fewer runs here."""
+    """The tolerances are those of the experiment published-error-maps. This test has fewer runs."""
     maps = study[name].maps
     analytic = maps["three frames"]
     assert correlation(maps["predicted"], analytic, clip) == pytest.approx(predicted, abs=0.03)

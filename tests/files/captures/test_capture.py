@@ -117,6 +117,7 @@ def test_ipv6_fragments_are_put_together() -> None:
 
 @given(st.binary(max_size=100), st.sampled_from([0, 6, 17, 43, 44, 51, 60]))
 def test_any_ipv6_packet_ends_quietly(data: bytes, next_header: int) -> None:
+    """No IPv6 packet raises an exception."""
     list(read_udp(pcap([(0, ethernet(ipv6(data, next_header)[: 20 + len(data)]))])))
 
 
@@ -135,6 +136,7 @@ def test_fragments_are_put_together_in_any_order() -> None:
 
 @given(st.binary(max_size=200), st.sampled_from([b"\x0a\x0d\x0d\x0a", b"\xd4\xc3\xb2\xa1"]))
 def test_any_bytes_end_quietly(data: bytes, magic: bytes) -> None:
+    """No bytes after the start of a capture file raise an exception."""
     list(read_udp(magic + data))
 
 

@@ -131,6 +131,7 @@ def test_z_is_up_for_any_screen_axis(tmp_path: Path, positions: NDArray[np.float
 
 
 def test_turning_to_z_up_keeps_the_hand(tmp_path: Path) -> None:
+    """The conversion to z up is a rotation, so the axes stay right-handed."""
     corner = np.array([[[2.0, 1.0, 1.0], [1.0, 2.0, 1.0], [1.0, 1.0, 2.0]]]) * 1000.0
     write_c3d(tmp_path / "trial.c3d", corner)
     for axis in ("x", "y", "z"):
@@ -151,6 +152,7 @@ def test_a_marker_in_the_origin_of_a_trc_is_missing(tmp_path: Path) -> None:
 def test_a_subjects_prefix_may_be_left_out_and_misspellings_are_met_halfway(
     tmp_path: Path, positions: NDArray[np.float64]
 ) -> None:
+    """Marker names need no subject prefix. A misspelled name gets suggestions."""
     write_c3d(tmp_path / "trial.c3d", positions)
     trial = read_marker_trial(tmp_path / "trial.c3d")
     assert np.array_equal(trial.points(["LKNE"]), trial.points(["Tom:LKNE"]), equal_nan=True)

@@ -95,6 +95,7 @@ def test_a_chain_moves_its_markers_as_opensim_does(tmp_path: Path, opensim: Any)
 
 
 def test_our_least_squares_are_those_of_opensim(tmp_path: Path, opensim: Any) -> None:
+    """On noisy markers, the marker errors equal those of OpenSim's inverse kinematics."""
     path = write_osim(tmp_path / "small.osim", [ROOT, HIP, KNEE], MARKERS)
     phase = np.linspace(0.0, 1.0, 9)
     values = np.outer(phase, np.random.default_rng(1).uniform(-0.6, 0.6, 10))

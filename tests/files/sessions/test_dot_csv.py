@@ -1,4 +1,4 @@
-"""CSV files of DOT sensors: times, ids, units, orientations and increments of every mode."""
+"""CSV files of Movella DOT sensors: times, ids, units, orientations and increments in all modes."""
 
 from __future__ import annotations
 

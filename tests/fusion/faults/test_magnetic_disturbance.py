@@ -50,9 +50,8 @@ def test_one_disturbed_sensor_of_four_is_corrected_and_no_other(
     assert found is not None
     assert found[0] == name
     assert found[1] == pytest.approx(off * DEG, rel=1e-3)
-    assert detector.ambiguity == pytest.approx(
-        SD, rel=1e-3
-    )  # the disturbance of the others is unobserved
+    # A disturbance common to all sensors is not observable.
+    assert detector.ambiguity == pytest.approx(SD, rel=1e-3)
 
 
 @given(off_deg=st.floats(20.0, 80.0))

@@ -108,9 +108,9 @@ def test_coarse_resolution_and_slow_filters_are_not_stuck(digits: int, speed: fl
     stuck = sum(
         bool(monitor.update(k * STEP, orientations)) for k, orientations in enumerate(frames)
     )
-    assert stuck <= (
-        50 if digits == 3 and speed < 1 else 0
-    )  # until its natural repetition time is known
+    # The detector learns how long the values of a sensor normally repeat. Before that, it may
+    # report a slow sensor with three digits.
+    assert stuck <= (50 if digits == 3 and speed < 1 else 0)
 
 
 def test_only_sensor_of_a_segment_is_compared_with_the_other_segment() -> None:

@@ -211,6 +211,7 @@ def test_a_movement_is_followed_live_with_its_covariance() -> None:
 
 
 def test_scaling_the_parent_stretches_the_way_of_the_center() -> None:
+    """The path of the joint center is scaled with the parent segment."""
     model = leg().scaled({"thigh": (1.0, 2.0, 3.0)})
     old, new = leg().segments[1].joint, model.segments[1].joint
     assert np.array(new.path)[:, 5:] == pytest.approx(np.array(old.path)[:, 5:] * [1, 2, 3])

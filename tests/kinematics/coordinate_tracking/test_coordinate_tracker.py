@@ -93,6 +93,7 @@ def test_each_instant_begins_at_the_one_before() -> None:
 
 
 def test_a_joint_of_two_angles_has_coordinates_although_noise_leaves_a_third() -> None:
+    """Noise causes a small rotation that the two angles of the joint cannot describe."""
     model = ChainModel((Segment("forearm"), Segment("hand", "forearm", Joint("ball"))), ())
     forearm, hand = default_coordinates(model)
     assert hand.pose is not None

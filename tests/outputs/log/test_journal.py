@@ -60,7 +60,7 @@ def handler(journald: socket.socket, stream: io.StringIO) -> Iterator[JournalHan
 
 
 def logger_to(handler: logging.Handler) -> logging.Logger:
-    made = logging.Logger("jointfit_daemon.test")  # noqa: LOG001 - one a test
+    made = logging.Logger("jointfit_daemon.test")  # noqa: LOG001 - a logger for each test
     made.addHandler(handler)
     return made
 

@@ -67,7 +67,7 @@ def test_device_name_cannot_forge_a_log_line(formatter: logging.Formatter) -> No
     stream = io.StringIO()
     handler = logging.StreamHandler(stream)
     handler.setFormatter(formatter)
-    log = logging.Logger("device")  # noqa: LOG001 - one of its own
+    log = logging.Logger("device")  # noqa: LOG001 - a logger for this test
     log.addHandler(handler)
     log.warning("S1: %s", FORGED, extra=journal_fields("device", FORGED))
     lines = stream.getvalue().splitlines()

@@ -68,6 +68,7 @@ async def running(link: Link) -> AsyncIterator[Link]:
 async def test_a_socket_closed_before_its_turn_leaves_no_traceback_in_the_log(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
+    """The filter drops the error of a socket that is closed before its callback runs."""
     noise, client = DisconnectErrorFilter(), aiomqtt.Client("127.0.0.1")
     asyncio.get_running_loop().set_exception_handler(noise)
     with socket.socket() as sock:

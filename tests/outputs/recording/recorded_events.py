@@ -1,4 +1,4 @@
-"""Events written to a recording by the recorder, and read from it."""
+"""Functions that write events to a recording with the recorder, and read them from it."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ class KilledRecording(NamedTuple):
     messages: int
     gaps: int
     late_s: float
-    """Longest time between two chunks, by which the load of the machine increases the loss."""
+    """Longest time between two recorded chunks, s. On a busy machine, it is part of `lost_s`."""
 
 
 def kill_one(folder: Path, after_s: float) -> KilledRecording:

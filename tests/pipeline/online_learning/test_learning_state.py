@@ -154,6 +154,7 @@ def test_monitor_without_frames_gives_no_notice() -> None:
 
 
 def test_correlations_belong_to_the_models() -> None:
+    """Online learning may change the models and their error correlations, and nothing else."""
     before = calibration()
     assert only_models_differ(before, replace(before, correlations={"knee": 0.5}))
     assert not only_models_differ(

@@ -218,7 +218,7 @@ def test_change_of_the_plane_begins_the_centers_again() -> None:
 def exchange_and_hide(
     exchanged_s: tuple[float, float], *hidden_s: tuple[float, float]
 ) -> Callable[[float, Array], Array]:
-    """Exchange T1 and T4 in one interval; T1 is hidden in others."""
+    """Exchange T1 and T4 in one interval, and hide T1 in other intervals."""
 
     def change(t_s: float, points: Array) -> Array:
         if exchanged_s[0] <= t_s < exchanged_s[1]:

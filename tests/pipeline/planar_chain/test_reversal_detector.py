@@ -1,4 +1,4 @@
-"""Reversal detector: exchanged labels of two markers, without joint centers and undecided."""
+"""Reversal detector: correct, exchanged and undecided labels of the two markers of a segment."""
 
 from __future__ import annotations
 
@@ -34,6 +34,7 @@ def update(
     ("angle", "labels"), [(1.4, Labels.CORRECT), (1.8, Labels.RENEWED), (-3.1, Labels.RENEWED)]
 )
 def test_rotation_decides_without_joint_centers(angle: float, labels: Labels) -> None:
+    """A rotation of more than a quarter turn renews the labels if no joint center decides."""
     detector = ReversalDetector()
     assert update(detector, 0.0, 0.0) is Labels.CORRECT
     assert update(detector, 1.0, angle) is labels
@@ -50,7 +51,7 @@ def test_joint_center_decides_although_the_marker_is_hidden_at_first() -> None:
     update(detector, 0.0, 0.0, HIDDEN)
     assert update(detector, 1.0, 3.0, HIDDEN) is Labels.UNDECIDED
     assert update(detector, 1.05, 3.0, HIDDEN) is Labels.UNDECIDED
-    point = 0.5j + exp(3.0j) * (0.2j + 0.15)  # correct for a rotation by 3 rad
+    point = 0.5j + exp(3.0j) * (0.2j + 0.15)  # the adjacent marker after a rotation by 3 rad
     assert update(detector, 1.1, 3.0, HIDDEN._replace(point=point)) is Labels.CORRECT
     assert update(detector, 1.15, 3.05) is Labels.CORRECT
 

@@ -65,9 +65,10 @@ def play(
     named: int = len(NAMES),
     tissue_rad: float = 0.0,
 ) -> list[TimedNotice]:
-    """Feed both streams at their rates, with one step every 10 ms; `named` markers are sent.
+    """Feed IMU samples at 100 Hz and mocap frames at 120 Hz; return the notices.
 
-    `tissue_rad` is the amplitude of the sensor's own rotation on the skin, at 2 Hz.
+    The mocap frames contain the first `named` markers. `tissue_rad` is the amplitude of a rotation
+    of the sensor relative to the bone, at 2 Hz.
     """
     rng = np.random.default_rng(5)
     t_ref = np.arange(start_s, start_s + seconds, 1 / 120)
@@ -108,6 +109,7 @@ def test_lag_is_estimated_during_movement() -> None:
 
 
 def test_orientations_of_overlapping_windows_equal_those_fitted_anew() -> None:
+    """Orientations that were fitted for earlier windows equal a new fit of the stored frames."""
     monitor = LagMonitor(CHAIN, CALIBRATION)
     play(monitor, 24.0, 4.0)
     track = monitor._tracks["thigh"]

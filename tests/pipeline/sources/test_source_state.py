@@ -44,7 +44,7 @@ def test_another_unit_of_device_time_after_reopening_is_a_restart_and_settles() 
 
 
 def restarts_after_reopening(pause_s: float, stall_s: float) -> tuple[list[str], int]:
-    """Close and reopen a sensor that continues to count; return restart events and their number.
+    """Reopen a sensor that continues to count; return restart events and the restart counter.
 
     The samples of the first `stall_s` after the pause arrive at once, so that the decoder needs
     longer to determine the unit of device time.

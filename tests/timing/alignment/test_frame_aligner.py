@@ -176,7 +176,7 @@ def test_a_stream_faster_than_the_frames_is_decimated() -> None:
     play(a, stream("A", 2_500_000, 400, phase=MS))
     counts = assert_accounted(a, "A")
     assert counts["decimated"] == pytest.approx(100, abs=4)
-    assert counts["used"] == pytest.approx(298, abs=4)  # two neighbors, and the sample before them
+    assert counts["used"] == pytest.approx(298, abs=4)  # per frame: two neighbors, one before
 
 
 def test_a_slow_stream_is_interpolated_between_its_samples() -> None:
@@ -203,6 +203,7 @@ def test_a_reordered_sample_takes_its_place_and_a_late_one_does_not() -> None:
 
 
 def test_a_frame_does_not_remember_neighbors_that_a_reordered_sample_parted() -> None:
+    """If a reordered sample falls between two samples, earlier frames do not affect later ones."""
     found = []
     for frames_before in (3, 0):  # 3: a frame at 0 ms, and two frames between samples
         a = aligner(A=10 * MS)

@@ -59,7 +59,7 @@ class ClockFaultRun:
             self.counter += 1
 
     def check(self, since: int, news: str) -> None:
-        """Check the news, the order of stamps, and that stamps are correct 5 s after `since`."""
+        """Check event and order of stamps; stamps are correct 5 s after sample number `since`."""
         assert longest_run_back([stamp.t_ns for _, stamp in self.out]) < BACKWARD_LIMIT
         for number, (true, stamp) in enumerate(self.out):
             healed = number >= since + HEALED_NS // PERIOD

@@ -119,6 +119,7 @@ def test_devices_without_time_are_stamped_evenly(delay: Delay, use: str, state: 
 
 @pytest.mark.parametrize("seconds", [3, 5])
 def test_a_young_clock_does_not_trust_its_slope(seconds: int) -> None:
+    """In the first seconds, stamps are accurate although the skew is still uncertain."""
     worst = []
     for seed in range(12):
         errors, _ = errors_of(DeviceClock(PERIOD), Device(seed).samples(6.5, latency_timer))
@@ -201,6 +202,7 @@ def test_a_clock_that_wraps_at_midnight_is_followed() -> None:
 
 
 def test_a_silence_of_many_wraps_keeps_the_clock() -> None:
+    """The device sends nothing for 45 s, and its time wraps every 6.55 s."""
     clock = DeviceClock(PERIOD)
     ticks = TickClock(100_000, 1 << 16)  # wraps after 6.55 s
     samples = [s for s in Device(7, skew=0.0).samples(90, punctual) if not 30 < s[2] / 100 < 75]
@@ -253,6 +255,7 @@ def test_a_clock_that_jumps_while_its_counter_does_not_is_a_restart() -> None:
 def test_backlog_that_ends_while_the_counter_stands_is_no_restart(
     stall: float, reopened: bool
 ) -> None:
+    """The samples before a pause arrive after it. The counter stands still during the pause."""
     clock, silent = DeviceClock(PERIOD), round(stall * S)
     first = 100 * S // 1000  # the device has run for 100 s
     for k in range(4000):
@@ -370,6 +373,7 @@ def test_samples_that_stay_late_are_a_restart_after_two_seconds() -> None:
 
 
 def test_a_pause_that_device_time_shares_but_the_counter_does_not_is_no_restart() -> None:
+    """During the pause of 4 s, device time advances and the counter stands still."""
     clock = DeviceClock(PERIOD)
     for k in range(3000):
         pause_us = 4_000_000 if k >= 2000 else 0
@@ -380,6 +384,7 @@ def test_a_pause_that_device_time_shares_but_the_counter_does_not_is_no_restart(
 
 
 def test_a_gap_shared_by_the_counter_is_no_restart() -> None:
+    """Device time and counter both advance during the gap."""
     clock = DeviceClock(PERIOD)
     samples = [s for s in Device(8).samples(30, punctual) if not 900 < s[2] < 1400]
     for true, ticks, counter, arrival in samples:

@@ -1,4 +1,8 @@
-"""Direct time from sync edges and declared clocks is used unless arrivals contradict it."""
+"""Direct time is used unless the arrival times contradict it.
+
+Direct time comes from the edges of a sync line, or from a device clock that is declared to show
+host time.
+"""
 
 from __future__ import annotations
 
@@ -97,7 +101,8 @@ def test_edges_remove_the_smallest_delay_to_a_few_microseconds() -> None:
     wired = Wired(least_delay_ms=2.2)
     wired.run(20.0, pulses=False)
     assert wired.imu.state == "passive"
-    assert np.mean(wired.imu_errors_us(100)) == pytest.approx(1200, abs=30)  # 2.2 ms less the prior
+    # The passive clock subtracts an assumed delay of 1 ms from the smallest delay of 2.2 ms.
+    assert np.mean(wired.imu_errors_us(100)) == pytest.approx(1200, abs=30)
     wired.run(20.0, begin=20.0)
     assert wired.imu.state == "direct"
     assert wired.imu.epoch == 0

@@ -1,4 +1,7 @@
-"""Clocks of servers, estimated from answered echoes: simulated echoes and a real capture."""
+"""Clocks of servers, estimated from answered echoes: simulated echoes and a real capture.
+
+An echo consists of the host times of a request and its reply, and of the server time in between.
+"""
 
 from __future__ import annotations
 

@@ -62,8 +62,8 @@ def stamped(arrivals: NDArray[np.int64]) -> tuple[DeviceClock, list[tuple[int, S
 stalls = st.lists(
     st.tuples(st.floats(0.02, 0.5), st.floats(0.2, 2.0)), min_size=1, max_size=5
 )  # fmt: skip
-"""Durations of work and stall, s. Two periods of work contain a punctual sample. Without punctual
-samples, increasing delays cannot be distinguished from a slow clock.
+"""Durations of work and stall, s. The work lasts at least two sample periods, so it contains a
+punctual sample. Without punctual samples, increasing delays look like a slow clock.
 """
 
 

@@ -60,7 +60,7 @@ def test_evenly_late_samples_are_reported_after_two_seconds() -> None:
         ([100.0, 50.0] * 200, True),  # mean delay above the fastest: 25 ms
         ([101.0, 50.0] * 200, False),
         ([50.0] * 150 + [0.0] + [50.0] * 199, False),  # a plausible sample ends the lateness
-        ([50.0] * 150 + [-6.0] + [50.0] * 60, True),  # an early sample does not end it
+        ([50.0] * 150 + [-6.0] + [50.0] * 60, True),  # an early sample does not end the lateness
     ],
 )
 def test_lateness_is_a_fault_only_if_the_fastest_samples_agree(

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 MS = 1_000_000
 EXPECTED_MS = {"02_undisturbed_slow_rotation_B_60s": (4.05, 0.20, 0.30)}
 EXPECTED_MS["07_undisturbed_fast_rotation_B_60s"] = (4.17, 0.05, 0.10)
+"""Lag, its tolerance, and the largest scatter of windows of about 10 s, ms, by recording."""
 
 
 class Excerpt(NamedTuple):
@@ -226,7 +227,7 @@ def test_either_stream_may_be_the_faster_one() -> None:
 
 
 def test_errors_are_consistent_with_sigma() -> None:
-    """Over all windows, the standard deviation of error / sigma is about one."""
+    """Over 16 simulated movements, the standard deviation of error / sigma is about one."""
     ratios = []
     for seed in range(16):
         estimate = estimate_lag(*made_up(seed, 5 * MS, noise=0.004, seconds=6.0))
@@ -275,7 +276,7 @@ def test_periodic_motion_is_ambiguous_in_a_wide_search() -> None:
     refused = estimate_lag(t_ns, q, t_ns, q, LagSettings(span_s=3.0)).refused
     assert refused is not None
     assert "periodic" in refused
-    # The default span excludes the other lags.
+    # The default span excludes lags that differ by a period.
     assert estimate_lag(t_ns, q, t_ns, q).refused is None
 
 

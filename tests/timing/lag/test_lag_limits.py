@@ -46,6 +46,7 @@ def test_a_standard_deviation_is_reported_in_milliseconds() -> None:
 
 
 def test_windows_overlap_to_three_quarters_so_their_variance_counts_four_times() -> None:
+    """Every instant is in four windows, so the variance of one window is multiplied by four."""
     tracked = LagTracker().feed(0, LagEstimate(5e6, 1e5, 0.0, None))
     assert tracked is not None
     assert tracked.lag_ns == pytest.approx(5e6)

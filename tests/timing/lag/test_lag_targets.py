@@ -19,6 +19,7 @@ TICK_MS, PERIOD_S = 0.5, 3.9
 
 
 def test_a_tap_in_a_window_of_rest_is_no_lag() -> None:
+    """A movement of 0.25 s in a window of rest does not determine a lag."""
     t_imu, q_imu, t_ref, q_ref = lag.made_up(1, 10.0, 5.0)
     for t, q in ((t_imu, q_imu), (t_ref, q_ref)):
         q[t < 5.0e9] = q[t < 5.0e9][-1]

@@ -1,4 +1,4 @@
-"""Folders of recordings for the tests of the batch."""
+"""Folders of recordings for the tests of `jointfit batch`."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 def process_tracker() -> None:
     """Start the resource tracker of multiprocessing before the tests.
 
-    Its pipe remains open until the exit. If a test started the tracker, the check for open
-    descriptors would fail.
+    The pipe of the tracker remains open until Python ends. If a test started the tracker, the
+    check for open file descriptors after this test would fail.
     """
     resource_tracker.ensure_running()
 

@@ -1,4 +1,4 @@
-"""Replacement for the processing of a recording, which waits or ends its process."""
+"""Replacement for the function that processes a recording. It waits, or ends its process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`jointfit batch` completes if a Dask worker is killed, and its memory does not grow."""
+"""`jointfit batch` completes if a Dask worker is killed, and its memory use has a limit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""`jointfit batch` equals the single commands; a fault or a stop affects one recording only."""
+"""`jointfit batch` writes the same files as the single commands.
+
+A fault affects one recording only, and a killed batch can be continued.
+"""
 
 from __future__ import annotations
 
@@ -144,6 +147,7 @@ def test_finished_recordings_are_not_processed_again(
 def test_a_result_counts_for_the_same_bytes_and_with_its_files_only(
     recordings: Recordings, tmp_path: Path
 ) -> None:
+    """A result is reused only if the recording is unchanged, and mark and output files exist."""
     (path,) = recordings(1).iterdir()
     task = task_of(path, tmp_path / "out", "report")
     process_recording(task)

@@ -1,4 +1,4 @@
-"""`jointfit calibrate` with a real daemon reports progress, signals and the loss of a terminal."""
+"""`jointfit calibrate` with a real daemon reports progress, and the cause of every abort."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ async def calibrate(rig: Path, *options: str) -> asyncio.subprocess.Process:
 
 
 async def line_with(process: asyncio.subprocess.Process, text: str) -> str:
-    """Return the next line of output that holds `text`."""
+    """Return the next line of output that contains `text`."""
     assert process.stdout is not None
     async with asyncio.timeout(PATIENCE_S):
         while line := (await process.stdout.readline()).decode():
@@ -48,7 +48,7 @@ async def line_with(process: asyncio.subprocess.Process, text: str) -> str:
 async def rest_of(process: asyncio.subprocess.Process) -> str:
     async with asyncio.timeout(PATIENCE_S):
         output, _ = await process.communicate()
-    process._transport.close()  # type: ignore[attr-defined]  # asyncio leaves it to the collector
+    process._transport.close()  # type: ignore[attr-defined]  # asyncio does not close it
     return output.decode()
 
 

@@ -1,4 +1,4 @@
-"""`PhaseTracker` finds the end of a phase in MQTT messages; results and progress become lines."""
+"""`PhaseTracker` finds the end of a phase in MQTT messages; results and progress are printed."""
 
 from __future__ import annotations
 

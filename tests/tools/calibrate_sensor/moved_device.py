@@ -94,19 +94,19 @@ def poses_at(seconds: float) -> Rotation:
 
 
 def turned_at(seconds: float) -> Rotation:
-    """Return the orientation after `seconds` of a rotation to all sides."""
+    """Return the orientation after `seconds` of the magnetometer step, a turn about all axes."""
     return Rotation.from_euler("zyx", (0.9 * seconds, 2.1 * seconds, 3.3 * seconds))
 
 
 def movement(step: str, seconds: float) -> Rotation:
-    """Return the orientation in a step, `seconds` after its instruction."""
+    """Return the orientation `seconds` after the instruction of a step."""
     if step == "accelerometer":
         return poses_at(seconds)
     return turned_at(seconds) if step == "magnetometer" else facing(LEVEL)
 
 
 def recorded_chunks(steps: dict[str, float]) -> Iterator[Chunk]:
-    """Yield the chunks that the device sends during the steps; `steps` contains durations, s."""
+    """Yield the chunks that the device sends; `steps` contains the duration of each step, s."""
     signals, t_ns = InertialSignals(ERRORS), 0
     for step, seconds in steps.items():
         for k in range(round(seconds * RATE_HZ)):
@@ -129,7 +129,7 @@ class MovingHand:
         self._device, self._step, self._begin_ns = device, "gyroscope", time.monotonic_ns()
 
     def follow(self, line: str) -> None:
-        """Begin the next movement if the line of output is an instruction."""
+        """Begin the next movement if `line`, printed by the command, is an instruction."""
         words = {"accelerometer": "six faces", "magnetometer": "in your hand"}
         for step, word in words.items():
             if word in line:

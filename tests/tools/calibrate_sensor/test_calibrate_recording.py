@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a recording of the rest, and of an accelerometer step that is too short."""
+    """Return a recording of 7 s of rest and of an accelerometer step that is too short."""
     folder = tmp_path_factory.mktemp("recorded")
     (folder / "rig.toml").write_text(RIG.format(port="/dev/ttyUSB0"), encoding="utf-8")
     chunks = recorded_chunks({"gyroscope": 7.0, "accelerometer": 3.0})

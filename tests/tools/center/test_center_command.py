@@ -26,7 +26,7 @@ NAMES = ("P1", "P2", "P3", "P4", "C1", "C2", "C3", "C4")
 PARENT = np.array([[0.0, 0.0, 0.1], [0.0, 0.12, 0.1], [0.05, 0.0, 0.25], [-0.06, 0.05, 0.3]])
 CHILD = np.array([[0.05, 0.0, -0.2], [-0.05, 0.03, -0.25], [0.02, 0.06, -0.3], [0.0, -0.06, -0.2]])
 CENTER = np.array([0.01, 0.02, -0.15])
-"""Center in the coordinates of PARENT. CHILD surrounds it."""
+"""Center in the coordinate system of the positions PARENT, m. The markers CHILD surround it."""
 OPTIONS = ["--parent", "P1,P2,P3,P4", "--markers", "C1,C2,C3,C4"]
 
 
@@ -60,7 +60,7 @@ def hinge_trial() -> MarkerTrajectories:
 
 
 def expected_in_parent() -> NDArray[np.float64]:
-    """Return CENTER from the definition of the axes, computed independently."""
+    """Return CENTER in the axes that the command defines by the parent markers, m."""
     x = PARENT[1] - PARENT[0]
     normal = np.cross(x, PARENT[2] - PARENT[0])
     ex, ez = x / np.linalg.norm(x), normal / np.linalg.norm(normal)
@@ -90,6 +90,7 @@ def test_a_ball_joints_center_is_found_in_the_parents_own_axes(trc: Path, method
 
 
 def test_the_place_in_the_world_is_in_the_files_axes_at_the_mean_pose(tmp_path: Path) -> None:
+    """The center in the world has the axes of the file, and belongs to the mean parent pose."""
     still = ball_trial(noise=0.0)
     parent = still.positions[:, :4]
     moved = still.positions.copy()

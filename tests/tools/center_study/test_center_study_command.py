@@ -38,7 +38,8 @@ def test_study_contains_its_setup_both_tables_and_every_limitation(tmp_path: Pat
     for text in CAVEATS:
         assert text in result.stdout
     cells = re.findall(r"-?\d\.\d\d/-?\d\.\d\d", result.stdout)
-    # Each of two grids has rows for three pairs: the published value and five clipping limits.
+    # Table 1 is printed for two positions of the grid. Each table has three pairs of parameters.
+    # The rows of a pair are the published value and the values for five clipping limits.
     assert len(cells) == 2 * 3 * (1 + 5)
     assert (out / "cor-study.txt").read_text("utf-8") == result.stdout
     for name in ("cor-study-figure-2", "cor-study-estimators"):

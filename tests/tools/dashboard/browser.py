@@ -28,7 +28,7 @@ SIZES = {"phone": (375, 812), "tablet": (768, 1024), "desktop": (1440, 900)}
 """Names and sizes of windows, CSS pixels."""
 VIEWS = ("live", "calibrate", "history", "sensors", "log", "table")
 SERIOUS = {"serious", "critical"}
-"""Impacts of axe-core that fail a test."""
+"""Impact levels of axe-core findings that make a test fail."""
 
 
 @dataclass
@@ -42,7 +42,7 @@ class OpenedPage:
 
     @property
     def foreign(self) -> list[str]:
-        """Requests that left the origin of the page."""
+        """Requests to another origin than that of the page."""
         own = urlsplit(self.origin).netloc
         return [url for url in self.requests if urlsplit(url).netloc != own]
 

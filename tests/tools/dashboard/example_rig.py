@@ -1,4 +1,4 @@
-"""A published rig with the limb of any rig.toml, which may have many segments or two branches."""
+"""A `PublishedRig` with the limb of any rig.toml, even with many segments or two branches."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ANGLES = {
     "elevation": ("plane", "elevation", "rotation"),
     "trunk": ("flexion", "bending", "rotation"),
 }
-"""Angles of a joint by its convention."""
+"""Names of the angles of a joint, by angle convention."""
 
 
 @dataclass

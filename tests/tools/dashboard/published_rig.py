@@ -120,7 +120,7 @@ class PublishedRig:
     commands: list[str] = field(default_factory=list)
     """Commands of the received requests."""
     turned: dict[str, tuple[str, float]] = field(default_factory=dict)
-    """Axis and angle, deg, by which a sensor was turned about its own axis."""
+    """Rotation of each sensor about one of its own axes: axis and angle, deg."""
     changes: dict[str, Any] = field(default_factory=dict)
     """Changed values of the message `calibration`, by key."""
     progress: dict[str, Any] | None = None

@@ -66,7 +66,7 @@ async def test_each_entry_of_the_menu_sends_its_request_and_shows_the_answer(
                 for value in arguments.values():
                     await page.page.fill("#action input", str(value))
                 if command != "selftest":
-                    assert sent_count(rig, command) == 0  # the confirmation is missing
+                    assert sent_count(rig, command) == 0  # the user has not confirmed yet
                     await page.page.click("#action .primary")
                 for part in parts:
                     await page.until_text("#action .answer", part)

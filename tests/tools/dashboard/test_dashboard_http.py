@@ -32,7 +32,7 @@ CONTENTS = {found.content for found in FILES.values()}
 def respond(
     target: str = "/", method: str = "GET", headers: list[tuple[str, str]] | None = None
 ) -> Response:
-    """Return the response to a request; the tunnel is not opened."""
+    """Return the response to a request that opens no tunnel to the broker."""
     request = Request(target, Headers([("Host", "localhost"), *(headers or [])]), method)
     response = SERVER.respond(None, request)  # type: ignore[arg-type]  # not used
     assert response is not None

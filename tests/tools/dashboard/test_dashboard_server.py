@@ -1,4 +1,4 @@
-"""The dashboard's web server sends files with security headers, and tunnels to real brokers."""
+"""The dashboard's web server sends files with security headers, and connects pages to brokers."""
 
 from __future__ import annotations
 

@@ -90,7 +90,7 @@ async def test_ctrl_c_ends_the_demo_with_a_result_line(tmp_path: Path, options: 
         await asyncio.sleep(1.0)  # the daemon is starting
         os.killpg(process.pid, signal.SIGINT)
         output, _ = await process.communicate()
-    process._transport.close()  # type: ignore[attr-defined]  # asyncio leaves it to the collector
+    process._transport.close()  # type: ignore[attr-defined]  # asyncio does not close it
     assert process.returncode == 128 + signal.SIGINT, output.decode()
     assert output.decode().splitlines()[-1].startswith("result: interrupted by SIGINT;")
     assert b"Traceback" not in output

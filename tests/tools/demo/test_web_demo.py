@@ -1,6 +1,6 @@
 """`jointfit demo --web` first prints the URL, with a QR code if other devices can open the page.
 
-After that it repeats phases that a busy computer ended.
+Later, the demo repeats calibration phases that were aborted because the computer was busy.
 """
 
 from __future__ import annotations

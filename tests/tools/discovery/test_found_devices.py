@@ -104,6 +104,7 @@ async def server() -> AsyncIterator[NatNetServer]:
 
 
 async def test_a_named_server_answers_with_its_names_and_is_left(server: NatNetServer) -> None:
+    """A server at a known address returns its names. The connection to it is then closed."""
     (found,) = await find_mocap_servers(["127.0.0.1"], port=server.command_port)
     assert (found.driver, found.server, found.port) == ("natnet", "127.0.0.1", server.command_port)
     assert (found.application, found.protocol) == ("Motive", "NatNet 4.0")

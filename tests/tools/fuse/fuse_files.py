@@ -1,4 +1,4 @@
-"""Files of simulated trials for `jointfit fuse`: a leg with soft-tissue artefact, and its pose."""
+"""Simulated files for `jointfit fuse`: movements with soft-tissue artefact, and a static pose."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def said(result: Any) -> str:
 
 
 def limb(k: int) -> tuple[Array, Array]:
-    """Return the orientations of thigh and shank in movement `k`, shape (N, 4) each.
+    """Return the orientations of thigh and shank in movement number `k`, shape (N, 4) each.
 
     Both segments are upright in the first frame.
     """

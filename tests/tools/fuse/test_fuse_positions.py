@@ -1,6 +1,7 @@
 """`jointfit fuse apply` writes correct joint positions, and the joint angles of the patent.
 
 The tests compute the expected values with SciPy rotations and with explicit quaternion products.
+The patent is CN 114533039 B.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`jointfit init` leaves the vertical axis to drivers whose server announces it."""
+"""`jointfit init` writes no vertical axis for a driver whose server announces the axis."""
 
 from __future__ import annotations
 

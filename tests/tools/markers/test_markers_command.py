@@ -145,6 +145,7 @@ def test_remedy_for_undetermined_markers_is_one_of_the_method(
 
 
 def test_a_lock_on_a_marker_with_a_dot_in_its_name_holds_it_whole(folder: Path) -> None:
+    """The option `--lock T3.x` locks all coordinates of the marker named T3.x."""
     found = answer(folder, "--lock", "T3.x")
     held = {m["name"]: m["held"] for m in found["markers"]}
     assert held["T3.x"] == [True, True, True]

@@ -1,4 +1,4 @@
-"""Messages of a walking subject's rig at fixed times; every payload matches its model."""
+"""Messages of a walking subject's rig at fixed times; each payload fits its payload model."""
 
 from __future__ import annotations
 

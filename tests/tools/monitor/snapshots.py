@@ -1,4 +1,4 @@
-"""Stored pictures of the screen, as SVG.
+"""Stored pictures of the screen of `jointfit monitor`, as SVG.
 
 With ``JOINTFIT_UPDATE_SNAPSHOTS=1`` the tests replace the stored pictures; check the new pictures,
 and commit them with the change. pytest-textual-snapshot has the same purpose, but needs an older

@@ -32,7 +32,7 @@ _UNFINISHED = re.compile(r"\x1b(?:\[[?>=<]?[\d;:]*[ -/]*|[\]P_][^\x07\x1b]*)?$")
 
 @dataclass
 class Screen:
-    """Characters of a terminal."""
+    """The characters on the screen of a terminal."""
 
     width: int
     height: int
@@ -86,7 +86,7 @@ class TerminalProgram:
     screen: Screen
     descriptor: int
     arrivals_s: list[float] = field(default_factory=list)
-    """Times at which a piece of output arrived."""
+    """Arrival times of the pieces of output, s."""
 
     def press(self, keys: str) -> None:
         """Send keys."""

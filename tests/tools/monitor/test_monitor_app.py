@@ -1,4 +1,4 @@
-"""The screen of the Textual program equals stored pictures, and the rate of updates is limited."""
+"""`MonitorApp` shows the stored pictures, and limits the rate of screen updates."""
 
 from __future__ import annotations
 
@@ -262,6 +262,7 @@ async def test_a_changed_number_redraws_only_its_cells(monkeypatch: pytest.Monke
 
 
 def test_pictures_belong_to_states() -> None:
+    """Every stored picture shows a state of `STATES`, and every state has a picture."""
     stored = {path.stem for path in STORED.glob("*.svg")}
     assert stored == {*STATES, "no-color"}
 

@@ -125,7 +125,7 @@ def test_missing_driver_is_named(run: RecordedRun, monkeypatch: pytest.MonkeyPat
 
 @contextlib.asynccontextmanager
 async def slow_link(broker: Broker) -> AsyncIterator[str]:
-    """Yield the address of a proxy that forwards at most 200 kB/s to the broker."""
+    """Yield the address of a proxy that forwards at most 205 kB/s to the broker."""
 
     async def forward(
         source: asyncio.StreamReader, sink: asyncio.StreamWriter, pause_s: float
