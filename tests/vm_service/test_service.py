@@ -118,8 +118,7 @@ def test_a_hung_daemon_is_killed_by_the_watchdog_and_starts_again(service: int, 
     eventually(lambda: show("ActiveState") == "active", "active again")
 
 
-def test_killed_service_is_restarted_without_further_loss(service: int) -> None:
-    """After the restart, poses are published again."""
+def test_killed_service_is_restarted_and_publishes_poses(service: int) -> None:
     os.kill(service, signal.SIGKILL)
     eventually(lambda: int(show("MainPID")) not in {0, service}, "a new process")
     eventually(lambda: messages("pose", seconds=3), "poses again")

@@ -166,7 +166,7 @@ class OpticalChain(Payload):
     t_us: Time
     frame: int
     model: str
-    refined: Any = Field(
+    refined: bool = Field(
         description="whether the marker positions come from the current calibration"
     )
     coordinates: dict[str, ChainCoordinate]

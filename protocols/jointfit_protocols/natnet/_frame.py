@@ -63,8 +63,7 @@ class Body(NamedTuple):
     qz: float
     qw: float
     error: float
-    """Mean marker error, m. The error does not show whether the pose is valid, because three
-    markers always fit."""
+    """Mean marker error, m. A small error does not show that the pose is valid; `params` does."""
     params: int
     """Flags. Bit 0 means tracked; if it is clear, the last valid pose is repeated."""
 

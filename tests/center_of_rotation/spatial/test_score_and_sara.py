@@ -45,7 +45,7 @@ def test_score_is_exact_without_noise_and_calibrated_with_noise() -> None:
     assert held >= 48
 
 
-def test_score_tolerates_frames_with_swapped_markers() -> None:
+def test_score_tolerates_frames_with_a_wrong_pose() -> None:
     """In 30 frames, the child pose is wrong by 0.3 m per axis, as with exchanged markers."""
     rng = np.random.default_rng(2)
     seen = watched(rng, ball_turns(rng, 60, 300))

@@ -144,7 +144,7 @@ def test_the_artefact_that_repeats_with_posture_widens_the_error() -> None:
     assert covers(found)
 
 
-def test_swapped_markers_in_some_frames_hardly_move_the_center() -> None:
+def test_a_wrong_pose_in_some_frames_hardly_moves_the_center() -> None:
     """In 20 frames, the child pose is wrong by 0.3 m per axis, as with exchanged markers."""
     rng, person = np.random.default_rng(8), subject(4)
     seen = person.observe(rng, 60.0, 1e-3)

@@ -250,7 +250,7 @@ def test_samples_that_share_one_time_stamp_are_reported_once() -> None:
     rare = Feeder(marker("T1"))
     for number in range(200):
         rare(1.0, 2.0, 3.0, at_s=0.01 * (number - number % 3 // 2))
-    assert "time stamp of the sample before" not in rare.texts("warning")
+    assert "time stamp of the previous sample" not in rare.texts("warning")
 
 
 def test_markers_of_the_same_name_are_told_apart_by_their_object() -> None:

@@ -76,8 +76,8 @@ def test_the_latency_of_usb_cameras_does_not_lead_before_the_start_of_the_counte
 
 
 @pytest.mark.parametrize("far", [1e38, -20_000.0, float("inf"), float("nan")])
-def test_position_of_an_occluded_marker_is_unknown(far: float) -> None:
-    """A position that is not finite or too far from the origin means an occluded marker."""
+def test_an_impossible_position_counts_as_an_occluded_marker(far: float) -> None:
+    """A position is impossible if it is not finite or too far from the origin."""
     got = ready().frame(frame(1, markers=(marker(65537, (0.0, far, 0.0)),)))
     assert np.isnan(got.markers).all()
 

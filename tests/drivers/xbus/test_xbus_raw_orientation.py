@@ -131,7 +131,7 @@ def test_a_short_gap_is_interpolated(lost: int) -> None:
     wires = [message(k, 100 * k, *items) for k, items in enumerate(turning(300))]
     whole, gapped = decoded(wires), decoded(wires[:150] + wires[150 + lost :])
     assert angle(samples(whole)[-1].q_world_sensor, samples(gapped)[-1].q_world_sensor) < 1e-6
-    assert not [e for e in gapped if isinstance(e, DeviceEvent) and "anew" in e.text]
+    assert not [e for e in gapped if isinstance(e, DeviceEvent) and "restarted" in e.text]
 
 
 def test_filter_restarts_with_the_same_heading_after_a_long_gap() -> None:
@@ -386,8 +386,7 @@ def test_a_magnetometer_without_a_filter_is_refused() -> None:
         setup(orientation="device", magnetometer=True)
 
 
-def test_only_the_filter_module_imports_the_package() -> None:
-    """The module of the driver does not import `vqf`, which is optional."""
+def test_the_driver_does_not_import_the_optional_package_of_the_filter() -> None:
     module = importlib.import_module("jointfit_drivers.xbus._driver")
     assert "vqf" not in vars(module)
 

@@ -20,7 +20,7 @@ async def run(gateway: Gateway) -> Outcome:
     version = store.save(plain_calibration(rig.chain))
     path = store.path(version)
     text = path.read_bytes()
-    path.write_bytes(text[: len(text) // 2] + b"\\0" * 40)
+    path.write_bytes(text[: len(text) // 2] + b"\0" * 40)
     await gateway.stop()
     gateway.listener.events.clear()
     recovered_s = await gateway.start()

@@ -280,8 +280,7 @@ def test_the_matrix_sent_is_the_rotation_of_the_quaternion_column_by_column(
     assert checked == 92
 
 
-def test_free_acceleration_is_acceleration_without_gravity_in_the_world(shared_data: Path) -> None:
-    """The quaternions that rotate accelerations to the world have norm 1."""
+def test_recorded_quaternions_have_norm_1(shared_data: Path) -> None:
     norms = [
         math.hypot(*value(items, Item.QUATERNION))
         for items in messages(shared_data, "5")
