@@ -32,6 +32,7 @@ BOARD = Material(
     "1 IMU on a rigid board without soft tissue (BROAD, trials 02 slow and 07 fast)",
     "optical motion capture of the board",
 )
+OMITTED_SAMPLES = BOARD._replace(reference="samples of the recording that are not used")
 LOWER_LIMBS = Material(
     "1 adult (OpenCap subject 4), 7 segments, 29 markers",
     "measured markers",

@@ -135,7 +135,7 @@ async def run_source(
     driver = source.driver_class(source.settings)
     path = device_path(source.settings)
     longest_s, first_pause_s = LAST_RETRY_S, PAUSE_S
-    retried = f"retrying with another device on the port, or every {PAUSE_S:g} s"
+    retried = f"trying again every {PAUSE_S:g} s, and when another device is on the port"
     if path is None:
         longest_s, first_pause_s = SERVER_RETRY_S, SERVER_PAUSE_S
         retried = f"retrying within {PAUSE_S:g} s"

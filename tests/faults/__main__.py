@@ -1,4 +1,4 @@
-"""``make faults``: run fault scenarios; with ``--repeat`` store the results and write the page."""
+"""``make faults``: run fault scenarios; with several runs of each, write docs/reliability.md."""
 
 from __future__ import annotations
 
@@ -55,13 +55,14 @@ def main() -> int:
     for key, found in outcomes.items():
         median_s, limit_s = summary(found)["recovered_median_s"], known[key].recovered_median_s
         if limit_s is not None and median_s > limit_s:
-            faults.append(f"{key}: recovered after {median_s:.2f} s in the median, {limit_s:g} s")
+            text = f"median time to recovery {median_s:.2f} s, limit {limit_s:g} s"
+            faults.append(f"{key}: {text}")
     print("\n".join(faults) or "all limits are met")
     return 1 if faults else 0
 
 
 def store(figures: dict[str, Any]) -> None:
-    """Store the figures of scenarios, and write the page."""
+    """Store the figures of scenarios, and write docs/reliability.md."""
     results = stored() if RESULTS.exists() else {"scenarios": {}}
     results["scenarios"] |= figures
     cores, python, load = os.cpu_count(), platform.python_version(), os.getloadavg()[0]

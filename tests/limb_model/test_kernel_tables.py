@@ -1,4 +1,4 @@
-"""Kernel models that are restored from damaged data."""
+"""Kernel models are restored from JSON; damaged data are rejected."""
 
 from __future__ import annotations
 

@@ -42,9 +42,12 @@ def test_initial_contact_is_near_the_heel_strike(
     walks: dict[int, tuple[SessionData, GaitCycles]],
 ) -> None:
     starts = np.array([gait.cycles_s[:, 0] for _, gait in walks.values()])
-    early_s = (starts + STRIDE_S / 2) % STRIDE_S - STRIDE_S / 2
-    assert -0.04 < np.median(early_s) < 0.0  # the shank turns back before the heel strikes
-    assert np.abs(early_s - np.median(early_s)).max() < 0.015
+    delay_s = (starts + STRIDE_S / 2) % STRIDE_S - STRIDE_S / 2
+
+    # A contact is detected where the rotation of the shank reverses, shortly before the heel
+    # strikes.
+    assert -0.04 < np.median(delay_s) < 0.0
+    assert np.abs(delay_s - np.median(delay_s)).max() < 0.015
 
 
 @pytest.mark.experiment
@@ -55,8 +58,8 @@ def test_mean_curve_of_the_knee_equals_the_true_one(
     for seed, (session, gait) in walks.items():
         knee = session.joints[0]
         found = normalize_cycles(knee.t_s, knee.angles["flexion"], gait.cycles_s)
-        # The reference cycles have the true length. They begin at the heel strikes plus the mean
-        # delay of the detected contacts.
+        # The reference cycles have the true length. They begin at the heel strikes, shifted by the
+        # mean offset of the detected contacts.
         strikes = np.round(gait.cycles_s[:, 0] / STRIDE_S) * STRIDE_S
         begin = strikes + (gait.cycles_s[:, 0] - strikes).mean()
         cycles = np.column_stack([begin, begin + STRIDE_S])

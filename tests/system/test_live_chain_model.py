@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from jointfit_daemon.tools.calibrate._phase_tracker import PhaseAbortedError
 from tests.system.station import Listener, Station, hang_up, running, stopped
 
 if TYPE_CHECKING:
@@ -70,9 +71,9 @@ async def lose_and_exchange_markers(
 
     # The static phase rejects the exchanged labels.
     await simulator.send_command("play stand")
-    status = await listener.phase("static", 3.0)
-    assert status["phase"] == "aborted"
-    assert "T1 and T3 look exchanged: T1 is at the place of T3" in status["text"]
+    exchange = "T1 and T3 look exchanged: T1 is at the place of T3"
+    with pytest.raises(PhaseAbortedError, match=exchange):
+        await listener.phase("static", 3.0)
 
     await simulator.send_command("show F2")
     await simulator.send_command("exchange T1 T3")

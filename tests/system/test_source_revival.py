@@ -110,7 +110,7 @@ async def test_source_uses_the_right_device_after_a_wrong_one_on_its_port(
             await listener.connected({"S1"}, RETRY_S * load_factor())
         child.check()
         log = (tmp_path / "daemon.log").read_text("utf-8")
-        assert log.count("retrying with another device on the port") == 1
+        assert log.count("and when another device is on the port") == 1
 
 
 @pytest.mark.timeout(180)

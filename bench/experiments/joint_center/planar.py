@@ -340,7 +340,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "circle-claimed-error",
-        "Predicted error divided by actual error, 8000 runs, and the acceptance threshold",
+        "Predicted error divided by actual error, and share of accepted estimates, 8000 runs",
         claims,
         SEEDED,
     ),
@@ -353,7 +353,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "circle-published-estimates",
-        "RMS error of accepted estimates divided by the Cramér-Rao bound, 20 000 runs",
+        "Upper 95 % limit of the RMS error, divided by the Cramér-Rao bound, 20 000 runs",
         at_the_bound,
         SEEDED,
         headline=True,

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from bench.framework.experiment import Experiment, Result
-from bench.framework.material import BOARD, SIMULATED_CLOCKS
+from bench.framework.material import OMITTED_SAMPLES, SIMULATED_CLOCKS
 from bench.rigs.core_trace import traced, true_errors
 from bench.subjects.simulated_clocks import REBOOTED, simulated
 from jointfit_daemon.kinematics.rotation_scalar import (
@@ -320,14 +320,14 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         "interpolation-recorded-board",
         "Error of the interpolation of a recorded board",
         board,
-        BOARD,
+        OMITTED_SAMPLES,
         ("broad_excerpts",),
     ),
     Experiment(
         "extrapolation-recorded-board",
         "Error of extrapolation by up to one sample period at 95 Hz, recorded board",
         ahead,
-        BOARD,
+        OMITTED_SAMPLES,
         ("broad_excerpts",),
     ),
     Experiment(

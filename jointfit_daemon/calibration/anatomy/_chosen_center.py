@@ -59,14 +59,16 @@ def chosen_center(
     r"""Estimate the center between two body parts by any method of `METHODS`.
 
     Planar methods use the plane perpendicular to the joint axis, which is estimated from the poses
-    of both parts. They reject a movement about several axes. If a part has an IMU, the angle θ of
-    the part about the axis a is computed from its rotation q relative to the neighbor,
+    of both parts. They reject a movement about several axes. If the distal part has an IMU, its
+    angle θ about the axis a is computed from
 
-    .. math:: q = q_{neighbor}^* \otimes q_{IMU}, \qquad
-              \theta = 2\, \mathrm{atan2}(q_{xyz} \cdot a, q_w).
+    .. math:: q = q_p^* \otimes q_{IMU}, \qquad
+              \theta = 2\, \mathrm{atan2}(q_{xyz} \cdot a, q_w),
 
-    If only the proximal part has an IMU, the two parts exchange their roles. The center has the
-    same coordinates in both parts, because both use the static world.
+    where q_p is the rotation of the proximal part since the static pose, from its markers, and
+    q_IMU the rotation of the distal part, from its IMU. The method ``oriented`` exchanges the two
+    parts if the distal part has no IMU. The center has the same coordinates in both parts, because
+    both use the static world.
 
     Parameters
     ----------

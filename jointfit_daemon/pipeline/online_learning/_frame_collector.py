@@ -44,7 +44,7 @@ MAX_FRAMES = 3000
 MIN_FRAMES = 600
 """Number of frames required for a refit, equal to one minute of movement."""
 REFIT_NS = 180_000_000_000
-"""Shortest time between two refits, ns. The first refit starts at this time after
+"""Shortest time between two refits, ns. The first refit starts when this time has passed since
 `MIN_FRAMES` frames were retained."""
 _FAULTS = {
     FrameFlag.STUCK: "sensor repeats its value",
@@ -229,7 +229,7 @@ class OnlineFrameCollector:
             after = before
         else:
             return
-        if after is None:  # both frames have the same instant
+        if after is None:  # the newest sensor frame has the instant of the mocap frame
             after = before
 
         sensors = self._sensors_at(t_ns, before, after)

@@ -56,8 +56,8 @@ class LagSettings:
     min_acceleration: float = radians(300.0)
     """Least RMS angular acceleration of the reference, rad/s²."""
     max_sigma_ns: float = 700_000.0
-    """Largest standard deviation, ns. Ordinary motion determines the lag with a much smaller
-    standard deviation. Random errors therefore do not decide whether its windows are accepted.
+    """Largest standard deviation, ns. Windows of ordinary motion are far below this limit, so the
+    random error of their standard deviation does not decide whether they are accepted.
     """
     min_r2: float = 0.98
     """Least R². Correct data on one rigid body reach 0.998; sensors on soft tissue reach less."""

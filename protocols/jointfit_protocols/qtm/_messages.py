@@ -114,7 +114,7 @@ class Discover(NamedTuple):
 
 
 class SkippedPacket(NamedTuple):
-    """A packet whose type is not read: a file or a newer type."""
+    """A packet that is not read: a file, a newer type, or a discovery of unexpected length."""
 
     type: int
     data: bytes
@@ -198,7 +198,7 @@ def _decode_components(packet: bytes, at: int, count: int) -> tuple[Component, .
             return "data packet ends before its last component"
         length, kind = COMPONENT_HEAD.unpack_from(packet, at)
         if not COMPONENT_HEAD.size <= length <= size - at:
-            return f"component of {length} bytes in {size - at}"
+            return f"component states {length} bytes, expected {COMPONENT_HEAD.size} to {size - at}"
         component = decode_component(kind, view[at + COMPONENT_HEAD.size : at + length])
         if isinstance(component, str):
             return component

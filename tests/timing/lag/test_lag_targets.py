@@ -1,4 +1,7 @@
-"""Lag estimates from windows with little motion; tests/bench/test_tables.py tests the targets."""
+"""Lag estimates from rest, short passages and continuous motion.
+
+The module tests/bench/test_tables.py tests the thresholds of the lag experiments.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 TICK_MS, PERIOD_S = 0.5, 3.9
-"""Height (ms) and period (s) of a sawtooth error of the stamps, at a skew of 128 ppm."""
+"""Sawtooth error of stamps in ticks of 0.5 ms: height (ms) and period (s). A clock skew of 128
+ppm shifts the stamps by one tick in 3.9 s."""
 
 
 def test_a_tap_in_a_window_of_rest_is_no_lag() -> None:
@@ -60,7 +64,7 @@ def test_the_standard_deviation_contains_the_stamp_error_of_a_short_passage(
 
 
 def test_even_motion_averages_the_stamp_error(shared_data: Path) -> None:
-    """Ten seconds of even motion determine the lag as accurately as vigorous motion."""
+    """In ten seconds of continuous motion, the sawtooth error of the stamps averages out."""
     recording = lag.excerpt(shared_data, lag.FAST)
     part = (recording.t_ns > 10e9) & (recording.t_ns < 20e9)
     imu = rates_from_gyro(recording.t_ns[part], recording.gyro[part], 0)
