@@ -122,9 +122,7 @@ class ChainRefinementTable(Settings):
     """``[calibration.chain_refinement]``: the same options as those of ``jointfit markers``."""
 
     method: RefinementMethod = Field(
-        "joint",
-        description="`joint`: poses and markers in one solve; `block`: poses and markers "
-        "alternately; `search`: coordinate search (slow)",
+        "joint", description="`joint`: markers and poses together, `block`: in turn, or `search`"
     )
     prior: float = Field(
         0.05,
@@ -133,9 +131,7 @@ class ChainRefinementTable(Settings):
         description="cost of a displacement relative to a tracking error; not with method `search`",
     )
     cost: RefinementCost = Field(
-        "l2",
-        description="`l2`: squared errors up to 20 mm, distances beyond; `l1`: distances (not "
-        "with method `search`)",
+        "l2", description="`l2`: squared errors up to 20 mm; `l1`: distances (not for `search`)"
     )
     weights: str | dict[str, float] = Field(
         default_factory=dict,
