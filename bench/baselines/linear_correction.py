@@ -5,8 +5,8 @@ r"""Baseline: a linear soft-tissue correction of the weighted mean, without kern
 
 Here :math:`f_0` is the weighted mean of the sensors of a segment, and :math:`\varphi` are the
 regressors from `features`. C is a robust ridge fit of :math:`\rho = \log(f_0^* \otimes q_{ref})`,
-where :math:`q_{ref}` is the reference. The factor :math:`\eta` is 1 in the training range and
-decreases outside it.
+where :math:`q_{ref}` is the reference. The factor :math:`\eta` is 1 in and near the training
+range, and decreases far outside it (`HULL`).
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ class LinearCorrection(SegmentModel):
     """Mean outer product of held-out residuals, rad^2, 3x3, segment axes."""
     residual_sd: float
     mean_sd: float
-    """RMS error of the uncorrected mean in training, rad per axis. It is the standard deviation of
-    a frame without an orientation of the neighbouring segment."""
+    """RMS error of the uncorrected mean in training, rad per axis. It is the predicted standard
+    deviation of a frame without an orientation of the neighbouring segment."""
     penalty: float
     movements: int
     """Number of movements in training."""

@@ -21,7 +21,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class RecordedStillnessLimits:
-    """Thresholds of rest. For a noisier sensor, use three times its values at rest on a table."""
+    """Thresholds of rest.
+
+    If the values of a sensor at rest on a table are above a third of `gyr` or `acc`, use three
+    times these values.
+    """
 
     window_s: float = 1.0
     """Duration of the window that must be at rest, s."""

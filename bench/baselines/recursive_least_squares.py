@@ -1,9 +1,9 @@
 # ruff: noqa: N806 - matrices have capital names
 r"""Recursive least squares with forgetting, compared with its batch form.
 
-Every update costs O(1). With a forgetting factor of 1, the result equals the batch fit. A factor of
-:math:`\mu = e^{-\Delta t/\tau}`, with the sample period :math:`\Delta t`, averages over about tau
-seconds.
+The cost of an update does not depend on the number of samples. With a forgetting factor of 1, the
+result equals the batch fit. A factor of :math:`\mu = e^{-\Delta t/\tau}`, with the sample period
+:math:`\Delta t`, averages over about tau seconds.
 """
 
 from __future__ import annotations

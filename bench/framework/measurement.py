@@ -50,8 +50,8 @@ def speed_experiment(
 ) -> Experiment:
     """Return an experiment of ``bench.experiments.speed``.
 
-    The argument of `measure` is True in the short run of `make bench`. An experiment that compares
-    settings and has no thresholds can be omitted from this run (`in_short_run` is False).
+    The argument of `measure` is True in the short run of `make bench`. If `in_short_run` is False,
+    the experiment is omitted from this run, for example because it only compares settings.
     """
     return Experiment(
         id,

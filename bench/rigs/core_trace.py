@@ -226,7 +226,10 @@ def _cut(
 def true_errors(
     trace: Trace, taken_ns: Mapping[tuple[str, int], int], unseen_ns: Mapping[str, int]
 ) -> dict[str, tuple[Floats, Floats, NDArray[np.bool_]]]:
-    """Return by stream: time since the start (s), error of the stamp (ms), and synced flag."""
+    """Return by stream: time since the start (s), error of the stamp (ms), and synced flag.
+
+    The error does not contain the minimum delay of the transport, which no clock can estimate.
+    """
     errors = {}
     for name, rows in trace.stamps.items():
         known = [row for row in rows if (name, row.ticks) in taken_ns and row.ticks is not None]

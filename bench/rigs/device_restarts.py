@@ -66,8 +66,7 @@ class RestartRun(NamedTuple):
         return errors
 
     def unexcused_ns(self, source: str) -> list[int]:
-        """Return the part of a source's errors that delays of a loaded machine do not explain,
-        ns."""
+        """Return a source's errors without the part that delays of a loaded machine explain, ns."""
         return [
             unexcused(sample.error_ns, sample.excused_ns)
             for sample in self.core.samples

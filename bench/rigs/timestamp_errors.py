@@ -202,8 +202,10 @@ class ObservedCore(Core):
 
 
 def unexcused(error_ns: int, excused_ns: int) -> int:
-    """Return the absolute error without its excused part, which only stamps after the true time
-    have."""
+    """Return the absolute error without its excused part, ns.
+
+    Only stamps after the true time have an excused part.
+    """
     return max(-error_ns, error_ns - excused_ns, 0)
 
 

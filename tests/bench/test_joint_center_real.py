@@ -1,4 +1,7 @@
-"""Predicted errors of the joint centers of a recorded trial are large enough (needs OpenSim)."""
+"""Errors of recorded joint centers are below twice the predicted error plus 18 mm.
+
+The reference are the joint centers of a scaled model, so the test needs OpenSim.
+"""
 
 from __future__ import annotations
 

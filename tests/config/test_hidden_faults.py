@@ -57,7 +57,7 @@ def check(folder: Path, text: str, *options: str) -> Any:
 
 
 def in_bus(text: str, keys: str) -> str:
-    """Return `text` with other keys in the table of the bus."""
+    """Return `text` with `keys` as the content of the table [can.can1]."""
     return text.replace('[can.can1]\nchannel = "can0"\n', f"[can.can1]\n{keys}\n")
 
 

@@ -3,7 +3,8 @@
 Four simulated sensors on serial lines, broker, daemon and listener run as in operation. The time of
 the daemon and of the sensors is accelerated. Memory, file descriptors, threads, tasks, Python
 objects, the age of samples, the error of poses and the clock skew are measured at even intervals.
-The command returns 1 if one of these values has a slope, or if poses, clocks or counters are wrong.
+The command returns 1 if the confidence interval of a slope does not contain zero, or if poses,
+clocks or counters are wrong.
 """
 
 from __future__ import annotations
@@ -255,7 +256,7 @@ def results_of(
 
 
 def main() -> int:
-    """Run the test; return 1 if a value has a slope or is wrong."""
+    """Run the test; return 1 if there are faults (`faults_of`)."""
     parser = argparse.ArgumentParser(prog="make endurance", description=__doc__)
     parser.add_argument("--samples", type=int, default=50_000_000, help="samples of all sensors")
     parser.add_argument("--factor", type=int, default=10, help="speed of the accelerated time")

@@ -5,7 +5,8 @@ blocks, which are longer than this dependence. A leak or a backlog of the daemon
 values of a block; another program of this machine increases some values. The first part of the run,
 in which caches fill, is left out.
 
-Invariant: of twenty runs without growth, about one has a slope in any of its quantities.
+A value *has a slope* if the interval of its slope does not contain zero. Invariant: of twenty runs
+without growth, about one has a slope in any of its quantities.
 """
 
 from __future__ import annotations
@@ -110,7 +111,7 @@ def outcomes_of(results: dict[str, Any]) -> str:
 
 
 def faults_of(results: dict[str, Any]) -> list[str]:
-    """Return the values that grow or are wrong."""
+    """Return a sentence for each value that has a slope, is unknown, or exceeds its limit."""
     faults = [
         f"{name} has a slope of {slope['per_million']:+.3g} ± {slope['half_width']:.2g}"
         " per million samples"

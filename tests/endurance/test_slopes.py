@@ -1,4 +1,4 @@
-"""A leak is detected in spite of noise; a run without a leak has the slope zero."""
+"""A leak is detected in spite of noise; without a leak, the interval of the slope contains zero."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def main() -> int:
-    """Run the scenarios; return 1 if a limit was exceeded."""
+    """Run the scenarios; return 1 if a scenario failed or exceeded a limit."""
     known = scenarios()
     parser = argparse.ArgumentParser(prog="make faults", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(known))

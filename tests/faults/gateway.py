@@ -359,7 +359,7 @@ class Gateway:
         )
 
     async def remove_old_recordings(self) -> None:
-        """Start a new recording and delete the others, because the disk is small."""
+        """Stop and delete all recordings, and start a new one, because the disk is small."""
         await self.request("record", action="stop")
         folder = self.in_namespace(self.folder / "recordings")
         for path in folder.iterdir():

@@ -93,7 +93,7 @@ async def _run_repeatedly(
         found.append(outcome)  # at once, for the results of an interrupted series
     recovered_s = statistics.median(outcome.recovered_s for outcome in found)
     took_s = time.monotonic() - began_s
-    print(f"{name}: recovered in {recovered_s:.2f} s; took {took_s:.0f} s", flush=True)
+    print(f"{name}: recovered in {recovered_s:.2f} s (median); took {took_s:.0f} s", flush=True)
 
 
 def summary(outcomes: list[Outcome]) -> dict[str, Any]:

@@ -62,12 +62,12 @@ class Scenario:
     def faults(self, outcome: Outcome, factor: float = 1.0) -> list[str]:
         """Return the exceeded limits; each limit is multiplied by the load factor `factor`."""
         measured = (
-            ("noticed", outcome.noticed_s, self.noticed_limit_s),
-            ("recovered", outcome.recovered_s, self.recovered_limit_s),
-            ("longest gap of poses", outcome.pose_gap_s, self.gap_limit_s),
+            ("noticed after", outcome.noticed_s, self.noticed_limit_s),
+            ("recovered after", outcome.recovered_s, self.recovered_limit_s),
+            ("longest time between poses", outcome.pose_gap_s, self.gap_limit_s),
         )
         return [
-            f"{self.title}: {name} after {value:.2f} s, limit {limit:g} s"
+            f"{self.title}: {name} {value:.2f} s, limit {limit:g} s"
             for name, value, limit in measured
             if limit is not None and value > limit * factor
         ]

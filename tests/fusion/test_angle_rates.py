@@ -17,7 +17,7 @@ def angles(*found: float) -> JointAngles:
 
 @pytest.mark.parametrize("step_ms", [2, 10, 20, 50])
 def test_rate_is_that_of_25_ms_or_half_a_frame_ago(step_ms: int) -> None:
-    """The rate refers to 25 ms, or half a frame if this is longer, before the newest frame."""
+    """The rate is that of 25 ms, or half a frame period if longer, before the newest frame."""
     follower, off = AngleRates(), []
     late_s = max(25, step_ms / 2) * 1e-3
     for t_ms in range(0, 2000, step_ms):

@@ -1,4 +1,4 @@
-"""Position of O1 in single mocap frames."""
+"""Position of the first joint (O1) in single mocap frames."""
 
 from __future__ import annotations
 

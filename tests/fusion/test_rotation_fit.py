@@ -1,4 +1,4 @@
-"""Rotation fit, at rotations for which one column of the adjugate matrix is zero."""
+"""Rotation fit, also at rotations for which columns of the adjugate matrix are zero."""
 
 from __future__ import annotations
 

@@ -132,7 +132,7 @@ def test_one_frame_reads_as_the_arrays_do(left: bool) -> None:
 
 
 def test_one_frame_reads_the_patents_angles_as_the_arrays_do() -> None:
-    """The function for one frame returns the angles of the function for arrays."""
+    """The function for one frame returns the patent's angles like the function for arrays."""
     proximal = random_rotations(300, 1)
     turns = np.vstack((random_rotations(297, 2), from_sequence("ZYX", LOCKED)))
     distal = rot.multiply(proximal, turns)

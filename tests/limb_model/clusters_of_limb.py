@@ -36,7 +36,7 @@ CENTERS = {
     ("thigh", "shank"): (0.0, 0.0, -LENGTH["thigh"]),
     ("shank", "foot"): (0.0, 0.0, -LENGTH["thigh"] - LENGTH["shank"]),
 }
-"""Joint centers of the standing limb from the hip, axes of the segments, m."""
+"""Joint centers of the standing limb relative to the hip, in the axes of the segments, m."""
 LABELS = tuple(name for part in LOCAL for name in MARKERS[part])
 
 

@@ -30,7 +30,7 @@ EXCHANGES = [
     ("thigh0", "thigh1", "thigh2", "thigh3"),
     ("pelvis0", "thigh1", "shank2", "foot3"),
 ]
-"""Within a segment, near a joint, across two, three and four segments."""
+"""Markers whose labels are exchanged in a cycle: within a segment, and across two to four."""
 
 
 def test_residuals_are_those_of_the_fit_of_a_trial() -> None:
@@ -74,7 +74,7 @@ def test_an_exchange_is_named_in_most_frames_and_hardly_ever_another_one(
 def test_a_search_spread_over_frames_finds_the_same_with_one_cluster_a_frame(
     labels: tuple[str, ...],
 ) -> None:
-    """A search that evaluates one cluster per frame finds the faults of a whole search."""
+    """A search of one cluster per frame finds the same faults as a search of all in one frame."""
     clusters, _, positions = person(2, skin_m=0.006, occluded=0.02)
     search = LabelSearch(clusters, centers_of(clusters))
     for points in cycled(positions[::240], *labels):

@@ -27,9 +27,10 @@ def table_of(results: dict[str, Any]) -> str:
 
 
 def faults_of(results: dict[str, Any]) -> list[str]:
-    """Return the inputs with a sample that was not sent, not received, lost, corrupt or dropped.
+    """Return the inputs with a sample that was not received, was lost, corrupt or dropped.
 
-    Inputs with a sample without an outcome are also returned.
+    Inputs with a sample without an outcome, and inputs that sent less than `SMALLEST_SHARE` of
+    their samples, are also returned.
     """
     return [
         f"{name}: {found}"

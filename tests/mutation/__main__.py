@@ -173,7 +173,8 @@ def _find(one: dict[str, Any]) -> Mutant:
 def record_executions(package: str) -> None:
     """Run the tests of a package without mutant, and store which lines each executes.
 
-    Stored tests are run again only if their file or a source of the package is newer.
+    Stored tests are run again only if their file or a source of the package is newer than the
+    record.
     """
     sources, tests = PACKAGES[package]
     record = _record(package)
@@ -214,8 +215,8 @@ def _executions(package: str) -> dict[str, Any]:
 def judge(package: str, mutant: Mutant) -> tuple[bool, str, str]:
     """Return whether a test detects the mutant, and the changed line before and after.
 
-    The tests that execute the changed statement are run. If an import executes the statement, all
-    tests of the nearest folder are run, too.
+    The tests that execute the changed statement are run. If an import executes the statement, the
+    tests that execute any line of its file, and all tests of the nearest folder are run.
     """
     executions = _executions(package)
     tests, at_import = tests_of(mutant.path, mutant.line, executions)

@@ -74,7 +74,8 @@ class ExecutionRecorder:
 def tests_of(path: Path, line: int, executions: dict[str, Any]) -> tuple[list[str], bool]:
     """Return the tests that execute a statement, fast ones first, and whether an import does so.
 
-    Tests of one file stay together, because they may have fixtures in common.
+    If an import executes it, the tests that execute any line of its file are returned. Tests of one
+    file stay together, because they may have fixtures in common.
     """
     lines = executions["lines"].get(str(path), {})
     found = {test for number in _statement(path, line) for test in lines.get(str(number), [])}

@@ -52,7 +52,7 @@ class Walk(NamedTuple):
 
 
 def walk(poses: Sequence[dict[str, Any]], optical: Sequence[dict[str, Any]]) -> Walk:
-    """Return a part of a run, from complete poses, at whose end the limb is as at its begin."""
+    """Return a part of a run, from complete poses, that ends in nearly the posture of its start."""
     poses, optical = ([pose for pose in each if _is_complete(pose)] for each in (poses, optical))
     forward = _forward(poses)
     imu, cameras = _track(poses, forward), _track(optical, forward)

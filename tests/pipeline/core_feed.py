@@ -77,7 +77,7 @@ def orientation(name: str, number: int) -> tuple[float, float, float, float]:
 
 
 def counter(number: int) -> int:
-    """Return the device's counter or ticks of sample `number`."""
+    """Return the device's counter of sample `number`."""
     return number % 65536
 
 

@@ -142,7 +142,7 @@ def test_missing_samples_delay_a_frame_by_one_and_a_half_periods_at_most(
 
 
 def test_missing_sample_delays_its_frame() -> None:
-    """The aligner waits for a missing sample. The limit in the test above concerns this wait."""
+    """One missing sample delays a frame by over half a period; the test above limits this delay."""
     whole, holed = waited(frozenset()), waited(frozenset({("S4", SETTLED + 5)}))
     delays = [holed[t_ns] - whole[t_ns] for t_ns in whole if t_ns in holed]
     assert max(delays) > 0.5 * PERIOD_NS

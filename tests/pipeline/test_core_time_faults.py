@@ -119,7 +119,7 @@ class Lived:
     fault_ns: int
 
     def between(self, begin_ns: int, end_ns: int) -> list[tuple[str, AlignedFrame]]:
-        """Return sync states and frames of an output interval, in time since the fault."""
+        """Return sync state and frame of the outputs in an interval, ns since the fault."""
         return [
             (state.sync, frame)
             for state, frame in zip(self.states, self.frames, strict=True)

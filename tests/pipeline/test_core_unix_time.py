@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 S = 1_000_000_000
 BITSTREAM = (4, 1)
 UNIX_NS = 1_795_250_000 * S - BEGIN_NS
-"""Offset of UNIX time, and of the grandmaster's UTC, from the host clock."""
+"""UNIX time, and UTC of the PTP grandmaster, minus the time of the host clock, ns."""
 TAI_NS = 37 * S
 HOUR_NS = 3_600 * S
 
@@ -115,11 +115,11 @@ class UnixTimeRig:
         self.bench.feed([UnixOffset(BEGIN_NS + self.number * PERIOD_NS, offset_ns)])
 
     def state(self) -> str:
-        """Return the health of the mocap clock."""
+        """Return the state of the mocap clock in the health message."""
         return str(self.bench.devices()["mocap"]["clock"])
 
     def errors_ms(self, since: int) -> list[float]:
-        """Return the errors of synced camera stamps from frame `since` on."""
+        """Return the errors of synced camera stamps from frame `since` on, ms."""
         return [
             (t_ns - BEGIN_NS - number * PERIOD_NS) / MS
             for number, t_ns, synced, _ in self.core.frames
@@ -127,7 +127,7 @@ class UnixTimeRig:
         ]
 
     def notices(self) -> list[Notice]:
-        """Return the notices about clocks."""
+        """Return the warnings, except those about rigid bodies."""
         notices = [n for n in self.bench.out if isinstance(n, Notice) and n.level == "warning"]
         return [n for n in notices if "rigid body" not in n.text]
 

@@ -130,7 +130,7 @@ def compare(
     synced: bool = True,
     change: Callable[[MocapFrame], MocapFrame] = lambda frame: frame,
 ) -> list[OpticalState]:
-    """Send camera frames with a delay of 5 ms between limb states, in order of arrival."""
+    """Return the comparison of the states with camera frames that arrive 5 ms late."""
     comparison = OpticalComparison(CHAIN, calibration(), rate_hz)
     frames, out = iter(camera_frames()), []
     t_ns, frame = next(frames)

@@ -290,7 +290,7 @@ async def test_failed_write_is_retried(rig: Rig, monkeypatch: pytest.MonkeyPatch
     ],
 )
 def test_calibration_age_is_zero_if_unknown(created: str, age_s: float) -> None:
-    """On a host without a real-time clock, the date may be wrong."""
+    """A date that is missing, has no time zone or is in the future gives the age 0."""
     now = datetime.datetime(2026, 3, 1, 11, tzinfo=datetime.UTC)
     calibration = Calibration("mean", (), (), (), {}, {}, {}, created_utc=created)
     assert _calibration_store.calibration_age_s(calibration, now) == age_s

@@ -90,7 +90,7 @@ class RecordingCore:
 
 
 def small(table: dict[str, Any], port: int, **moods: str) -> dict[str, Any]:
-    """Return a rig of the two plain simulated drivers, one on each segment."""
+    """Return a rig of two simulated sensors, one on each segment."""
     imus = [imu | {"mood": moods.get(imu["id"], "well")} for imu in table["imu"][:2]]
     imus[1]["segment"] = "shank"
     return {

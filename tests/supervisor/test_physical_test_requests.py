@@ -1,4 +1,4 @@
-"""The request `physical-test`: one test at a time, with the result of `jointfit probe`."""
+"""The request `physical-test`: one test at a time, as in `jointfit probe --physical-test`."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ def test_damaged_store_is_reported(rig: Rig, tmp_path: Path) -> None:
 
 
 async def test_worker_ends_with_its_parent(tmp_path: Path) -> None:
-    """The parent process starts a worker with an endless job and is then killed."""
+    """The parent process starts a worker with a job of a minute and is then killed."""
     parent = (
         "import subprocess, sys, time\n"
         "worker = subprocess.Popen([sys.executable, '-c', sys.argv[1]], stdin=subprocess.PIPE)\n"

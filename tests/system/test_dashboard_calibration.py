@@ -1,8 +1,7 @@
-"""The dashboard with the daemon and simulated hardware: calibration with cameras, and the
-processor time and memory of the page and its server.
+"""The dashboard with the daemon and simulated hardware: calibration with cameras, and its cost.
 
-The run writes screenshots of every view and the measured cost (``cost.json``) to
-``build/dashboard``.
+The cost is the processor time and the memory of the page and of its server. The run writes
+screenshots of every view and the measured cost (``cost.json``) to ``build/dashboard``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Hostile requests over MQTT: the daemon keeps running and publishes poses without gaps."""
+"""Hostile requests over MQTT neither stop the daemon nor delay its poses by `POSE_GAP_S`."""
 
 from __future__ import annotations
 

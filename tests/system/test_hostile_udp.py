@@ -1,4 +1,4 @@
-"""Hostile UDP datagrams: the daemon accepts only datagrams of its camera server."""
+"""Hostile UDP datagrams have no effect, or do not stop the frames if the sender is forged."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ CONTROL: tuple[bytes, ...] = (
     bytes(200),
     *(bytes((kind, 0, 4, 0)) + b"\xff" * 4 for kind in NatNetMessageId),
 )
-"""Messages that would change or end the session if they came from the server."""
+"""Messages that try to change or end the session."""
 
 
 class AttackedCameras:

@@ -46,11 +46,11 @@ async def test_every_synced_frame_has_correct_time(tmp_path: Path, broker: Broke
 
 @pytest.mark.timeout(180)
 async def test_wired_sync_line_removes_the_transport_delay(tmp_path: Path, broker: Broker) -> None:
-    """Stamps of a clock with sync edges agree with the stamps of the cameras although the transport
-    delay of the sensor is unknown.
+    """Stamps of clocks with sync edges agree with the stamps of the cameras.
 
-    On a loaded machine, the clock of the cameras has an error, and all clocks with sync edges have
-    the same error. `test_every_synced_frame_has_correct_time` tests this error.
+    The daemon does not know the transport delay of the sensors. On a loaded machine, the clock of
+    the cameras has an error, and all clocks with sync edges have the same error.
+    `test_every_synced_frame_has_correct_time` tests this error.
     """
     found = await live(tmp_path, broker.port, (), rest_s=9.0, more=("--sync-line",))
     assert found.replayed

@@ -1,5 +1,6 @@
-"""State of the machine before each test: simulator and broker run, the rig is installed, and the
-service does not run.
+"""State of the machine before each test: the simulator and the broker run, the service does not.
+
+The rig of the simulator is installed.
 """
 
 from __future__ import annotations

@@ -26,8 +26,8 @@ METHODS: tuple[Method, ...] = ("mean", "patent12", "patent6", "anchored")
 WALKERS: tuple[Method, ...] = ("patent12", "patent6", "anchored")
 ALLOWED_DEG = 0.1
 REPEATED_DEG = 0.01
-"""Largest accepted angle, deg, between the segments in ``pose`` and the patent's regression that is
-evaluated from other messages (`Played.repeated_deg`)."""
+"""Largest accepted angle, deg, between a segment in ``pose`` and the result of the patent's
+regression, which is computed again from other messages (`Played.repeated_deg`)."""
 
 
 @cache

@@ -137,7 +137,7 @@ def three_movements(data: Path) -> list[Result]:
 
 
 def facing_elsewhere(data: Path) -> list[Result]:
-    """Measure the largest change of a fused orientation if the subject faces another direction."""
+    """Measure the change of fused orientations, apart from the turn, if the subject turns."""
     squats = Squats(data)
     models = KneeModels("anchored", [squats.training])
     straight = models.predict(squats.held)

@@ -171,7 +171,7 @@ def fresh(one: Person, calibration: Calibration, begin_s: float, end_s: float) -
 
 
 def taught(seed: int, calibration: Calibration) -> tuple[Calibration, int]:
-    """Return the calibration after all rounds of online learning, and how many were accepted."""
+    """Return the calibration after all rounds of learning, and the number of accepted refits."""
     taken = 0
     for k in range(ROUNDS):
         begin_s = LEARN_S + k * ROUND_S

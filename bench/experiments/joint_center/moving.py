@@ -1,8 +1,8 @@
 """Running estimates of joint centers of a simulated leg whose knee center moves after calibration.
 
-The test counts reports of a moved center, with and without a movement. The movement in the
-calibration (walking, squats, guided movement) differs from the movement in the test (walking,
-sitting down and standing up), so the soft-tissue artefact differs, too.
+The experiment counts reports of a moved center, with and without a displacement of the center. The
+movement in the calibration (walking, squats, guided movement) differs from the tested movement
+(walking, sitting down and standing up), so the soft-tissue artefact differs, too.
 """
 
 from __future__ import annotations

@@ -61,7 +61,10 @@ def held_percent(found: Iterable[CenterEstimate]) -> float:
 
 
 def measure_noise(runs: int) -> list[Result]:
-    """Measure the coverage of all runs and of the worst subject, and the RMS errors."""
+    """Measure the coverage of all runs and of the worst subject, and the RMS errors.
+
+    A rejected estimate counts as not covered.
+    """
     results = []
     for rom, markers, noise in product(ANGLES_DEG, (3, 4), (0.5e-3, 1e-3, 2e-3)):
         people = estimates(rom, markers, (noise, 0.0), runs)

@@ -71,7 +71,11 @@ def turns_off_deg(model: ChainModel, a: ChainState, b: ChainState) -> Array:
 
 
 def occluded(data: Path) -> list[Result]:
-    """Occlude one marker per segment in half of all frames, and then 20 % of all markers."""
+    """Measure errors with occluded markers, in two runs.
+
+    In the first run, each segment lacks one marker in a frame with a probability of 0.5. In the
+    second run, 20 % of all markers are occluded at random.
+    """
     model, truth, clean = exact(data)
     rng = np.random.default_rng(0)
     y = clean.copy()

@@ -38,7 +38,7 @@ value, m, OpenSim's solution is counted as a local minimum."""
 
 
 def every_movement(data: Path) -> list[Result]:
-    """Train pelvis and legs on the static pose and three movements; evaluate on the fourth."""
+    """Refine markers of pelvis and legs on static pose and three movements; evaluate the fourth."""
     subject = opencap_legs(data)
     figures, errors, stuck = [], [], 0
     for name in EVERYTHING:

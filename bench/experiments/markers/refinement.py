@@ -60,7 +60,7 @@ def rms_mm(found: Refinement, trial: str) -> float:
 
 @cache
 def walked(data: Path) -> tuple[Refinement, float]:
-    """Return the refinement on walking alone, and its duration, s."""
+    """Return the refinement on walking alone, and its CPU time, s."""
     model, trials = oc4_lower(data), [motion(data, "walking1")]
     refine_markers(model, trials, PLAIN)
     began = time.process_time()

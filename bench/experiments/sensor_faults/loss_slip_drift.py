@@ -58,7 +58,7 @@ KNEE_GOAL_DEG = 5.0
 KNEE = Chain(("hip", "knee", "ankle"), SEGMENTS, (("S1", "S2"), ("S3", "S4")))
 SEMIREAL_HZ = 100.0
 SOON_S = 3.0
-"""Time after the start of a fault in which jumps are counted, s."""
+"""Time after the start of a fault in which the largest jump is searched, s."""
 SOON_TOLD_S = 2.0
 JUMP_GOAL = 1.61
 """Radius of the sphere that contains 95 % of normal errors, in units of the predicted RMS error."""

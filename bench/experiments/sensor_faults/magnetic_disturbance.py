@@ -55,11 +55,13 @@ class Pulled(NamedTuple):
     """Results of one subject and one disturbance."""
 
     delay_s: float
-    """Time from a deviation of 10 degrees to the first event, s; infinite without event."""
+    """Time from a deviation of 10 degrees to the first warning, s; infinite without a warning."""
     ended_s: float
-    """Time from the end of the disturbance to the event of recovery, s."""
+    """Time from the end of the disturbance to the last event of recovery, s; infinite without
+    event."""
     others: int
-    """Number of events about other segments or without a disturbance."""
+    """Number of events about other sensors or segments. If both sensors of a segment are disturbed,
+    events about either segment are accepted."""
     segment: Array
     """Error of both segments divided by the predicted RMS error, during the disturbance, shape (2
     n,)."""

@@ -1,7 +1,8 @@
 """Inverse kinematics of a chain model in the daemon: CPU time of a camera frame.
 
-The results are the mean time of a frame, and the time of the slowest frame with faulty markers. The
-time of a frame is the minimum over the repeats, so other processes hardly affect it.
+The results are the mean time of a frame, and the time of the slowest frame with healthy and with
+faulty markers. For the slowest frame, the time of each frame is the minimum over the repeats, so
+other processes hardly affect it.
 """
 
 from __future__ import annotations

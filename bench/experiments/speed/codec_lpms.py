@@ -1,7 +1,7 @@
 """LPMS: CPU time of codecs and decoders per message, compared with cantools on CAN.
 
-No Python package reads LP-BUS, so its codec has no comparison. In the same run, cantools decodes a
-CAN frame from a table of the same four signals.
+No Python package reads LP-BUS, so its codec has no comparison. In the same run, cantools decodes
+the same CAN frames with a table of their four signals.
 """
 
 from __future__ import annotations

@@ -1,5 +1,4 @@
-"""CPU time per message that arrives on an event loop, for readers of the daemon and of other
-packages.
+"""CPU time per message on an event loop, for readers of the daemon and of other packages.
 
 The messages are read from a pseudo-terminal (pty). Only one message is in transit at a time, so
 each message wakes the loop once. The receiver writes the next message, and the CPU time of writing

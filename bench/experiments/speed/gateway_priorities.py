@@ -1,8 +1,9 @@
 """Latency while other programs use all cores, with the priorities that systemd can set.
 
-Programs in another session compute without pause; their number is twice the number of cores. The
-settings of the daemon are measured in turn. The other parts of the measurement (devices, broker,
-subscriber) have real-time priority in all settings, so only the daemon waits for a core.
+Programs in another session compute without pause; their number is twice the number of cores. For
+comparison, one setting has no such programs. The settings of the daemon are measured in turn. The
+other parts of the measurement (devices, broker, subscriber) have real-time priority in all
+settings, so only the daemon waits for a core.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ CORES = sorted(os.sched_getaffinity(0))
 
 @dataclass(frozen=True)
 class Setting:
-    """Priority of the daemon, and whether other programs compute."""
+    """Priority and cores of the daemon, and whether other programs compute."""
 
     name: str
     busy: bool = True
@@ -85,7 +86,7 @@ def programs(number: int) -> Iterator[None]:
 
 
 def threads_of(pid: int) -> list[int]:
-    """Return the numbers of the threads of a process."""
+    """Return the thread ids of a process."""
     return [int(thread.name) for thread in Path(f"/proc/{pid}/task").iterdir()]
 
 
@@ -96,7 +97,7 @@ def raise_priority(pid: int) -> None:
 
 
 def apply(setting: Setting, pid: int) -> None:
-    """Set the priority of the daemon."""
+    """Set the priority and the cores of the daemon."""
     Path(f"/proc/{pid}/autogroup").write_text(f"{setting.session_nice}\n", "ascii")
     cores = CORES[:1] if setting.one_core else CORES
     for thread in threads_of(pid):

@@ -28,7 +28,11 @@ VARIANTS = {"sources": False, "compiled": True}
 
 
 def rows(quick: bool) -> list[Result]:
-    """Return CPU share, memory and latency of both variants; medians of the rounds."""
+    """Return CPU share, latency, memory and unaccounted samples of both variants.
+
+    The CPU share is the median of the rounds, the memory the maximum. Latencies and counts are of
+    all rounds together.
+    """
     if (reason := MosquittoBroker.missing()) is not None or (reason := _missing_modules()):
         print(f"not run: {reason}", file=sys.stderr)
         return []

@@ -1,8 +1,8 @@
 """CPU time to publish a pose: with the daemon's connection, with aiomqtt alone, and by a socket.
 
 The broker is a thread that accepts connections and discards the received data. The result is the
-CPU time of the publishing thread only. Like the daemon's poses, a message is sent after the
-previous message was accepted.
+CPU time of the publishing thread only. As with the daemon's poses, a publisher sends a message
+after its connection has accepted the previous message.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Cost of a recording at 4 × 400 Hz: share of a processor core, memory, and size of the file.
 
-The same process sends the same events with and without recording, in turns.
+A process with recording and a process without recording handle the same events, in turns. The CPU
+time and the memory of a recording are the differences between the two processes.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[3]
 ROUNDS, SECONDS, QUICK_S = 3, 20.0, 10.0
 HOUR_S = 3600.0
 MOST_SHARE_PCT, MOST_MEMORY_MB = 3.0, 40.0
-"""Targets of the share of a core, percent, and of the memory, MB."""
+"""Targets of the additional share of a core, percent, and of the additional memory, MB."""
 
 
 def _cost(folder: Path, seconds: float, *options: str) -> dict[str, Any]:

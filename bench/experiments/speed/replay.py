@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 SECONDS, ROUNDS = 90.0, 3
 """Recorded time after the calibration, s, and number of alternating rounds."""
 GOAL_MS = 20.0
-"""Target of the CPU time per second of recording, ms. It is 50 times real time."""
+"""Target of the CPU time per second of recording, ms: processing at 50 times real time."""
 
 
 def replay_results(_quick: bool) -> list[Result]:

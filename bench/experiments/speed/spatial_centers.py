@@ -37,7 +37,7 @@ def feeding(watched: bool) -> Callable[[], Callable[[], object]]:
     def work() -> Callable[[], object]:
         stream = RunningSphere(4, forgetting=0.999)
         fill(stream, points[:50])
-        if watched:  # the estimate also detects markers that leave their spheres
+        if watched:  # after an estimate, `feed` detects markers off their spheres
             stream.estimate()
         return lambda: fill(stream, points)
 

@@ -92,7 +92,7 @@ def errors_deg(frames: Sequence[AlignedFrame], motion: Motion) -> list[float]:
 
 
 def slerped_deg(period_ns: float, frames: Sequence[AlignedFrame], phase_ns: int) -> float:
-    """Return the RMS error of spherical interpolation (slerp) between samples in these frames."""
+    """Return the RMS error of interpolation (slerp) between exact samples at these frames, deg."""
     found = []
     for frame in frames[5:]:
         k = int((frame.t_ns - BEGIN_NS - phase_ns) // period_ns)

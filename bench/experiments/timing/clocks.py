@@ -125,7 +125,11 @@ def echoes(_: Path, runs: int = 200) -> list[Result]:
 def passive(
     delays: Delays, seconds: float, goals: tuple[float, float], runs: int
 ) -> tuple[list[Result], NDArray[np.float64], NDArray[np.float64]]:
-    """Return results of the final errors, skew errors, and errors divided by predicted sd."""
+    """Return results of the final stamp errors, and two values of each run.
+
+    These values are the final skew error, ppm, and the final stamp error divided by its predicted
+    sd.
+    """
     ends, skews, scaled = [], [], []
     for seed in range(runs):
         errors, clock, sigmas = passive_run(seed, delays, seconds)

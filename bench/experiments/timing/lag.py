@@ -38,7 +38,7 @@ HALF_FRAME_MS = 1e3 / 240
 FAST, SLOW = "07_undisturbed_fast_rotation_B", "02_undisturbed_slow_rotation_B"
 MARGIN_S = 0.3
 MOST_SIGMAS = 4.0
-"""Largest allowed ratio of the error of an accepted window to its standard deviation."""
+"""Largest allowed lag error of an accepted window, divided by its predicted standard deviation."""
 FAST_SD_MS = {2.0: 0.054, 5.0: 0.025, 10.0: 0.02, 30.0: 0.02}
 SLOW_SD_MS = {2.0: 0.307, 5.0: 0.21, 10.0: 0.14, 30.0: 0.14}
 """Target standard deviations of the lag, ms, by length of the window, s."""
@@ -169,7 +169,10 @@ def excerpts(
 
 
 def honest(data: Path) -> list[Result]:
-    """Check, for each disturbance, that no accepted error exceeds four standard deviations."""
+    """Check that no error of an accepted window exceeds four predicted standard deviations.
+
+    Each disturbance of the optical data is checked separately.
+    """
     treatments = {
         "as recorded": AS_IT_IS,
         "0.3 deg optical noise": Treatment(noise_deg=0.3),
@@ -192,7 +195,7 @@ def honest(data: Path) -> list[Result]:
 
 
 def worst_ratio(name: str, ratios: Sequence[float]) -> Result:
-    """Return the largest ratio of an error to its standard deviation, with the median ratio."""
+    """Return the largest of the ratios of error to predicted sd; the note contains the median."""
     note = f"{len(ratios)} windows, median {np.median(ratios):.2f} sd" if ratios else "no windows"
     return Result(name, max(ratios, default=0.0), MOST_SIGMAS, unit="sd", note=note)
 
@@ -302,7 +305,7 @@ def track(drift: float, seed: int) -> tuple[float, float]:
 
 
 def drift(_: Path) -> list[Result]:
-    """Check that over two minutes zero drift is reported as zero, and 1 ppm is detected."""
+    """Check that two minutes of data yield drifts of 0, 1 and -1 ppm within two predicted sd."""
     figures = []
     for truth, seed in ((0.0, 1), (0.0, 2), (1.0, 3), (-1.0, 4)):
         found, sd = track(truth * 1e-6, seed)
@@ -349,7 +352,10 @@ def cost(data: Path) -> list[Result]:
 
 
 def ordinary(data: Path) -> list[Result]:
-    """Measure the accuracy of ten seconds of vigorous motion, of ordinary motion, and of rest."""
+    """Measure the lag errors of 10 s windows of vigorous and of ordinary motion.
+
+    In addition, count the windows that are accepted although the sensor rests.
+    """
     figures = []
     for name, label, goal in ((FAST, "vigorous", 0.02), (SLOW, "ordinary", 0.14)):
         recording = excerpt(data, name)

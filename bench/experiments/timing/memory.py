@@ -158,7 +158,7 @@ class Hardware:
 
 
 def watch(hours: float, looks_an_hour: int) -> tuple[list[Held], int, int]:
-    """Run a core for some hours; return its memory over time, and numbers of samples and states."""
+    """Run a core for some hours; return its memory over time, and numbers of chunks and states."""
     core = Core()
     made = rig()
     core.feed(Configured(BEGIN_NS, made, None))

@@ -76,7 +76,7 @@ def test_gyroscope_bias_has_the_stated_uncertainty() -> None:
         found = fed(GyroscopeStep(), sensor.at_rest(8.0, seed)).finish()
         error = found.bias - sensor.gyroscope_bias
         errors.append(np.linalg.norm(error))
-        # `distance` is proportional to Hotelling's T squared
+        # 3 `distance` is Hotelling's T squared, which has a scaled F distribution
         count, freedom = found.degrees_of_freedom, found.degrees_of_freedom - 2
         limit = f_distribution.ppf(0.95, 3, freedom) * count / freedom
         inside.append(distance(error, found.covariance) < limit)

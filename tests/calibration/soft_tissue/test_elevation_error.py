@@ -1,4 +1,4 @@
-"""The error of a shoulder is that of its elevation, because flexion is undefined in abduction."""
+"""The error of a shoulder is its elevation error, as flexion is undefined at 90° abduction."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_an_error_along_the_elevation_is_found_exactly() -> None:
 def test_holdout_and_online_errors_of_an_abducted_shoulder_are_not_magnified(
     joint: str, most_deg: float
 ) -> None:
-    """At 90 degrees of abduction, rotation errors of 1 degree cause far larger flexion errors."""
+    """Near 90° of abduction, errors of 1° cause large errors of flexion, but not of elevation."""
     rng = np.random.default_rng(2)
     raised = Rotation.from_rotvec(np.outer(np.radians(rng.uniform(85.0, 95.0, N)), [0, -1, 0]))
     noisy = raised * Rotation.from_rotvec(rng.normal(0.0, math.radians(1.0), (N, 3)))

@@ -27,7 +27,7 @@ CHAIN = Chain(("hip", "knee", "ankle"), ("thigh", "shank"), (("S1", "S2"), ("S3"
 
 
 def limb(alike: float, seed: int = 1) -> LimbTraining:
-    """Return squats in which all sensors of a segment have one random error about x.
+    """Return squats in which all sensors of a segment have the same random error about x.
 
     The error does not depend on posture. `alike` is the correlation of the errors of thigh and
     shank.

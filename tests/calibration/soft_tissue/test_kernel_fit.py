@@ -54,7 +54,7 @@ class Knee:
 
 
 def test_data_without_movement_leaves_the_mean_as_it_is() -> None:
-    """Without movement in the training, the correction is hardly worse than the sensor mean."""
+    """Without knee movement, the error is at most 5 % larger than the error of the sensor mean."""
     knee = Knee(bend=0.0)
     rng = np.random.default_rng(4)
     for i in (0, 1):
@@ -142,14 +142,14 @@ def test_the_claim_grows_outside_of_the_training() -> None:
 
 
 def test_errors_beyond_the_training_are_claimed_larger_than_shown() -> None:
-    """Beyond the leverage ratios of the residuals, the predicted error exceeds the residuals."""
+    """At larger leverage ratios than those of the residuals, the predicted error exceeds them."""
     rng = np.random.default_rng(2)
     near = measure_spread([rng.uniform(0, 1, 900)], [rng.normal(0, 0.02, (900, 3))], np.ones(900))
     within = np.array(near.at(0.5))
     assert np.all((within > 0.014) & (within < 0.026))
     assert np.all(np.array(near.at(2.0)) > 1.5 * within)
 
-    # At the leverage ratio r = 1.5, the fit has a prior observation of three times the RMS error.
+    # The fit assumes an error of three times the RMS residual at the leverage ratio 1.5.
     ratios = np.array(near.at(1.5)) / within
     assert np.all((ratios > 2.4) & (ratios < 3.0))
 
@@ -259,7 +259,7 @@ def test_a_stored_model_with_wrong_types_is_found_wherever_they_are() -> None:
 
 
 def test_trial_with_much_upright_standing_is_fitted() -> None:
-    """The cross-validation also holds out the only moving frames; the rest has no leverage."""
+    """One fold of the cross-validation holds out all moving frames; the rest is one posture."""
     knee = Knee()
     for q in (*knee.sensors, knee.other, knee.bone):
         q[100:] = (1.0, 0.0, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""Published regression coefficients: one set verified on held-out data, and the stored set."""
+"""Published regression coefficients: those of the hold-out evaluation, and the stored ones."""
 
 from __future__ import annotations
 

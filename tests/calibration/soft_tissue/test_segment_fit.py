@@ -196,7 +196,7 @@ def test_axes_are_claimed_apart_and_together() -> None:
 
 
 def test_model_without_information_is_the_mean() -> None:
-    """If sensor errors do not depend on posture, the model is as accurate as the sensor mean."""
+    """If errors do not depend on posture, the error exceeds that of the mean by at most 2 %."""
     rng = np.random.default_rng(3)
     limb = Limb()
     limb.sensors = [

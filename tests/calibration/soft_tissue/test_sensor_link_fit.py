@@ -72,7 +72,7 @@ def test_standard_deviation_of_a_link_contains_its_error_in_untrained_postures(
 
 
 def test_movement_in_which_residuals_are_alike_leaves_a_link_less_certain() -> None:
-    """Slow noise has fewer independent frames than white noise, so the prediction is worse."""
+    """Slow noise has fewer independent frames than white noise, so the predicted sd is larger."""
     random = np.random.default_rng(2)
     thigh = radians(20.0) * np.sin(np.linspace(0.0, 60.0, N))
     white = random.standard_normal(N)

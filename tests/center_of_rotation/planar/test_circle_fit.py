@@ -270,8 +270,8 @@ def test_arcs_are_counted_between_the_outermost_points() -> None:
 def covered(truth: float) -> tuple[float, float]:
     """Return the coverage of published ellipses, and the fraction of centers that are published.
 
-    Both are integrals over the conditioning T, which has the normal distribution N(truth, 1). The
-    number of frames is assumed to be unlimited.
+    Both are integrals over the estimated conditioning T (`CenterEstimate.conditioning`), which has
+    the normal distribution N(truth, 1) if the number of frames is unlimited.
     """
     z, dz = np.linspace(-9, 9, 20_001, retstep=True)
     t = truth + z

@@ -47,7 +47,7 @@ def test_angles_halve_the_error_of_a_short_arc() -> None:
 
 
 def test_angles_of_another_limb_do_little_harm() -> None:
-    """Angles that contradict the points increase the error by less than 25 %."""
+    """Angles that contradict the points increase the error of the circle fit by less than 25 %."""
     aided, alone, flagged = [], [], 0
     for seed in range(60):
         p, t = arc(60.0, seed=seed)

@@ -131,7 +131,7 @@ def test_fading_noise_is_not_counted_as_soft_tissue_artefact() -> None:
 @pytest.mark.parametrize("rank", [1, 2, 3])
 @pytest.mark.parametrize("freedom", [20.0, 100.0, 5000.0])
 def test_the_published_ellipse_has_the_quantile_of_its_freedom(rank: int, freedom: float) -> None:
-    """The size of the ellipse is the 95 % quantile of the F distribution, times the rank."""
+    """The squared Mahalanobis radius is the 95 % quantile of the F distribution, times the rank."""
     exact = rank * float(fisher.ppf(0.95, rank, freedom))
     assert within95(rank, freedom) == pytest.approx(exact, rel=0.02)
 

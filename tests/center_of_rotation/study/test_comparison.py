@@ -69,7 +69,7 @@ def test_averaged_centers_of_small_angles_are_worse_than_centers_of_averaged_pos
     found = average_repetitions(StudySetup())
     at = dict(zip(np.rint(np.rad2deg(STEPS_RAD)).tolist(), range(len(STEPS_RAD)), strict=True))
     assert found.mean_of_centers[at[10]] > 3.0 * found.center_of_means[at[10]]
-    # at a large angle, both errors are inversely proportional to the root of the repetitions
+    # at a large angle, both errors decrease with the root of the number of repetitions
     expected = 0.001 * 4.3 / np.sqrt(StudySetup().repeats)
     assert found.mean_of_centers[at[45]] < expected
     assert found.center_of_means[at[45]] < expected

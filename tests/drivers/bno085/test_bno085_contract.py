@@ -1,4 +1,4 @@
-"""Conformance tests of the BNO085 driver, in both modes."""
+"""Conformance tests of the BNO085 driver, in the modes UART-RVC and UART-SHTP."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Start of the BNO085 driver with devices in both modes, and the settings that it changes."""
+"""Start of the BNO085 driver in the modes UART-RVC and UART-SHTP, and the settings it changes."""
 
 from __future__ import annotations
 

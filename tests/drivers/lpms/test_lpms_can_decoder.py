@@ -86,7 +86,7 @@ def texts(events: list[Decoded], kind: str) -> list[str]:
 
 
 def test_lpbus_in_can_frames_is_the_stream_of_the_serial_line() -> None:
-    """Generation 1 has this third mode on CAN. No driver supports the mode."""
+    """Generation 1 can also send LP-BUS packets in CAN frames. No driver supports this mode."""
     frames = recorded(3, mode="lpbus", node=1)
     assert {frame.can_id for frame in frames} == {0x515}
     assert max(len(frame.data) for frame in frames) == 8
@@ -192,7 +192,7 @@ def arrivals(gaps: ArrivalGaps, times: list[float]) -> tuple[int, list[float]]:
 
 @given(st.integers(0, 2**32), st.integers(20, 150), st.integers(1, 7))
 def test_delays_are_no_losses_and_losses_are_counted(seed: int, place: int, lost: int) -> None:
-    """Samples without a counter are counted by the times of their arrival."""
+    """Without a counter, the number of lost samples is found from the arrival times."""
     chance = random.Random(seed)
     sound = [10.0 * k + (chance.uniform(0, 8) if k % 9 else 0.0) for k in range(200)]
     assert arrivals(ArrivalGaps(100.0), sound) == (0, [])

@@ -266,7 +266,7 @@ def test_packets_before_a_reply_with_the_outputs_are_decoded_with_it() -> None:
 def test_the_stamps_of_a_file_of_raw_bytes_do_not_contradict_the_device_time(
     ratio: int, reported: bool
 ) -> None:
-    """If device time runs much faster than arrivals, the data come from a file without stamps."""
+    """Device time 3 times as fast as the arrivals is reported, but not 30 times: this is a file."""
     check = TickRateCheck(500, is_seconds=False)
     found = [check.feed(500 * ratio * second, second * 10**9) for second in range(10)]
     assert any(found) == reported

@@ -280,7 +280,7 @@ def test_comparisons_of_the_clocks_are_echoes() -> None:
 
 
 def test_stamps_of_another_clock_are_reported_and_give_no_echo() -> None:
-    """The stamps are not from the clock of the sender that LSL compares with that of the host."""
+    """The stamps come from another clock than the sender's, which LSL compares with the host's."""
     feed = Feeder(marker("T1"))
     feed(1.0, 2.0, 3.0)
     feed.trip(difference_s=-900.0)

@@ -188,7 +188,7 @@ async def test_multicast_frames_are_counted_at_each_card() -> None:
 async def test_frames_at_another_card_are_multicast_on_two_interfaces(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The server may send multicast through another card than the configured one."""
+    """Multicast may arrive at another card of this host than the one that the driver uses."""
 
     async def at_the_other(*_: object) -> dict[str, int]:
         return {ETH.address: 0, OTHER.address: 90}

@@ -134,7 +134,7 @@ def giant(count: int) -> ModelDefinition:
 def test_a_model_of_one_datagram_costs_no_second_and_bounded_columns(
     model: ModelDefinition,
 ) -> None:
-    """A hostile model with many items takes less than 1 s, and at most 4000 items are columns."""
+    """A model with very many items takes less than 1 s and has at most 4000 markers and bodies."""
     feeder = Feeder(markers={"thigh": ["T1", "T2", "T3", "T4"]})
     feeder(INFO)
     began = time.process_time()

@@ -270,7 +270,7 @@ async def test_silence_names_the_transport_where_it_contradicts_the_server(
 async def test_a_server_that_answers_but_sends_no_frames_is_lost_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The second connection emits its answers only with the first frame."""
+    """After the first loss, the driver emits answers of the server only with the first frame."""
     monkeypatch.setattr(_session, "FIRST_ECHOES", 1)
     server = serve()
     table = {"driver": "natnet", "server": "127.0.0.1", "silence_s": 0.2}

@@ -230,7 +230,7 @@ async def test_a_sensor_with_other_identifiers_is_hinted_at(tmp_path: Path) -> N
 async def test_identifiers_of_another_width_are_no_reason_to_change_their_number(
     tmp_path: Path, extended: bool
 ) -> None:
-    """The number arrives with 29 instead of 11 bits, or the reverse: `extended_ids` is wrong."""
+    """The identifiers have the right number, but 29 instead of 11 bits, or the reverse."""
     adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
     device = XcdiDevice(adapter, XcdiDeviceOptions(ids=id_block(0x200, extended=not extended)))
     ids = XcdiIdSettings(sample_time=0x205, group_counter=0x206, quaternion=0x221)

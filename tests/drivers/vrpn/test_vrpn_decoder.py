@@ -98,7 +98,7 @@ def test_bodies_hidden_in_turns_are_not_merged() -> None:
 
 
 def test_a_stall_of_the_server_costs_no_report() -> None:
-    """After a pause, the mean period is too long, and the next reports follow closely."""
+    """Pauses make the estimated period much longer than the intervals between the other reports."""
     feeder = Feeder()
     t_us = T0_US
     for n in range(60):

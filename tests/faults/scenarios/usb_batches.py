@@ -1,4 +1,4 @@
-"""A USB adapter delivers the samples of both sensors in pairs, every 20 ms."""
+"""USB adapters deliver two successive samples of a sensor together, every 20 ms."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 async def run(gateway: Gateway) -> Outcome:
-    """Send the samples of both sensors in pairs for two seconds."""
+    """Send successive samples of each sensor in pairs for two seconds."""
     since = len(gateway.listener.poses)
     before = (await gateway.health())["devices"]["S1"]
     for sensor in gateway.sensors.values():
@@ -30,7 +30,7 @@ SCENARIO = Scenario(
     title="USB adapter that delivers samples in pairs",
     reported="not a fault; visible in `jitter_us` of the device",
     continues="poses from both sensors",
-    counted="late samples; counter `late` of the device",
+    counted="late samples; the figure is the sum of `late` and `dropped` of one sensor",
     run=run,
     noticed_limit_s=1.0,
     recovered_limit_s=1.0,

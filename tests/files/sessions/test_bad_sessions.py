@@ -219,7 +219,7 @@ DAMAGED_DATA_SETS: dict[str, tuple[str, str | None]] = {
     "expected name": ("*S1_channels.tsv", "a\tb\n"),
     "_channels.tsv": ("*S1_channels.tsv", None),
 }
-"""Pattern and new content (None: removed) of files, by words of the expected message."""
+"""Name pattern of the damaged files and their content (None: removed), by the expected words."""
 
 
 @pytest.mark.parametrize("words", DAMAGED_DATA_SETS)

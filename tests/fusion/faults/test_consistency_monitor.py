@@ -151,7 +151,7 @@ def test_end_of_a_slip_is_reported(
 
 
 def disturbed(t_s: Array, q: Array, degrees: float) -> Array:
-    """Return a sensor with a magnetic disturbance from 8 to 20 s, with ramps of 3 s."""
+    """Return orientations with a heading error that begins at 8 s and ends at 23 s, in 3 s each."""
     away = np.clip((t_s - 8.0) / 3.0, 0.0, 1.0) - np.clip((t_s - 20.0) / 3.0, 0.0, 1.0)
     return rotation.multiply(rotation.heading(np.radians(degrees) * away), q)
 

@@ -41,7 +41,7 @@ def limb(seconds: float, *, speed: float = 1.0, noise_deg: float = 0.05, seed: i
 
 
 def detection_time_ms(frames: Frames, inject: Callable[[Frames], Frames], name: str) -> float:
-    """Return the time of detection, ms, and check that no other sensor is detected."""
+    """Return the time of detection, ms since frame 0; check that no other sensor is detected."""
     monitor, found = StuckSensorDetector(GROUPS), np.inf
     for k, orientations in enumerate(inject(frames)):
         stuck = monitor.update(k * STEP, orientations)

@@ -232,7 +232,7 @@ def test_one_short_connection_raises_suspicion_only_with_a_reason() -> None:
 
 
 def takeovers(first: TakeoverDetector, gap_s: float, handshake_s: float, reason: bool) -> list[int]:
-    """Return which of two daemons lost each connection, until one of them waits.
+    """Return which of two daemons lost each connection, until one of them gives way.
 
     Daemon 1 connects `gap_s` after daemon 0. The publisher waits after each loss, for a random time
     between half of a limit and this limit. The limit is 0.05 s at first and doubles up to 0.6 s.

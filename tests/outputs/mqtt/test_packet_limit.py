@@ -47,7 +47,7 @@ def message(topic: str, payload: bytes, *, retained: bool) -> bytes:
 
 
 def passed_on(sent: bytes, chunk: int, admit: Callable[[str, bool], bool] | None = None) -> bytes:
-    """Return the bytes for a reader that reads like paho: header byte by byte, then the rest."""
+    """Return what a reader receives that, like paho, reads single bytes and longer pieces."""
     ours, theirs = socket.socketpair()
     with ours, theirs:
         ours.setblocking(False)

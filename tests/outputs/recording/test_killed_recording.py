@@ -38,7 +38,7 @@ class KilledRecording(NamedTuple):
     messages: int
     gaps: int
     late_s: float
-    """Longest time between two recorded chunks, s. On a busy machine, it is part of `lost_s`."""
+    """Longest time between recorded chunks, s, by which `lost_s` may exceed `LONGEST_LOSS_S`."""
 
 
 def kill_one(folder: Path, after_s: float) -> KilledRecording:

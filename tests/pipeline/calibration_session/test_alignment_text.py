@@ -1,4 +1,4 @@
-"""The status text after the align phase names sensors that moved on the plate or have no lag."""
+"""Status text after the align phase: deviations from the plate, lags, and sensors without lag."""
 
 from __future__ import annotations
 

@@ -242,7 +242,7 @@ def test_exchanged_labels_are_named_at_every_rate(labels: tuple[str, ...], rate_
 
 
 def test_a_marker_on_the_wrong_segment_is_excluded_and_its_segment_is_named() -> None:
-    # the marker of the shank is fixed to the thigh, 3 cm from two of its markers
+    # shank1 is fixed to the thigh, 3 cm from thigh1
     wrong = replaced("shank1", lambda _, p: 0.5 * (p[4] + p[5]) + (p[6] - p[7]) * 0.2)
     states, notices = track(10.0, wrong)
     assert [n.data.get("moves_with") for n in notices] == [None, "thigh"]

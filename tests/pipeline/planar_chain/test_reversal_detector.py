@@ -34,7 +34,7 @@ def update(
     ("angle", "labels"), [(1.4, Labels.CORRECT), (1.8, Labels.RENEWED), (-3.1, Labels.RENEWED)]
 )
 def test_rotation_decides_without_joint_centers(angle: float, labels: Labels) -> None:
-    """A rotation of more than a quarter turn renews the labels if no joint center decides."""
+    """If no joint center decides, the labels after more than a quarter turn count as renewed."""
     detector = ReversalDetector()
     assert update(detector, 0.0, 0.0) is Labels.CORRECT
     assert update(detector, 1.0, angle) is labels

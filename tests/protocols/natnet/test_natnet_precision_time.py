@@ -1,4 +1,4 @@
-"""Precision timestamps with fractions of zero: their time, and when it becomes known."""
+"""Precision timestamps whose fractions are zero: no time, or a time after twenty frames."""
 
 from __future__ import annotations
 

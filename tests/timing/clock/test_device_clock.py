@@ -255,7 +255,7 @@ def test_a_clock_that_jumps_while_its_counter_does_not_is_a_restart() -> None:
 def test_backlog_that_ends_while_the_counter_stands_is_no_restart(
     stall: float, reopened: bool
 ) -> None:
-    """The samples before a pause arrive after it. The counter stands still during the pause."""
+    """The last 20 samples before a pause arrive after it. The counter stands still in the pause."""
     clock, silent = DeviceClock(PERIOD), round(stall * S)
     first = 100 * S // 1000  # the device has run for 100 s
     for k in range(4000):
@@ -361,7 +361,7 @@ def test_a_jump_at_the_end_of_a_pause_is_reported(jump: float) -> None:
 
 
 def test_samples_that_stay_late_are_a_restart_after_two_seconds() -> None:
-    """Device and clock paused for 0.3 s, and no counter reveals the pause."""
+    """The device and its clock paused for 0.3 s, and no counter reveals the pause."""
     clock = DeviceClock(PERIOD)
     epochs = {}
     for true, ticks, number, arrival in Device(14).samples(20, punctual):

@@ -24,8 +24,8 @@ PERIOD = 10 * MS
 START = 7_000 * S
 OWN = TickClock(1000, 1 << 32)
 SETTLING_S = 8.0
-"""Settling time of a clock if the host stalls from the start, s: three times the time without
-stalls.
+"""Longest permitted settling time of a clock if the host stalls from the start, s. Without stalls,
+a clock settles within 3 s.
 """
 
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 MS = 1_000_000
 EXPECTED_MS = {"02_undisturbed_slow_rotation_B_60s": (4.05, 0.20, 0.30)}
 EXPECTED_MS["07_undisturbed_fast_rotation_B_60s"] = (4.17, 0.05, 0.10)
-"""Lag, its tolerance, and the largest scatter of windows of about 10 s, ms, by recording."""
+"""By recording, ms: lag, its tolerance, and the largest sd of the lags of parts of about 10 s."""
 
 
 class Excerpt(NamedTuple):
@@ -74,7 +74,7 @@ def test_a_rate_stamped_at_the_left_sample_would_be_detected(excerpt: Excerpt) -
 
 
 def test_ten_seconds_at_camera_rate_suffice(excerpt: Excerpt) -> None:
-    """The scatter is measured with cameras at 120 Hz, random phase and random lag."""
+    """The lag of 12 parts of a recording, with cameras at 120 Hz, random phase and random lag."""
     rng = np.random.default_rng(7)
     optical = Rotation.from_quat(excerpt.optical, scalar_first=True)
     found, sigmas = [], []
@@ -95,7 +95,7 @@ def test_ten_seconds_at_camera_rate_suffice(excerpt: Excerpt) -> None:
     lag, tolerance, spread = EXPECTED_MS[excerpt.name]
     assert np.mean(found) == pytest.approx(lag, abs=tolerance)
     assert np.std(found) < spread
-    # The scatter is low, because windows overlap.
+    # The parts overlap, so their lags may differ less than their standard deviations suggest.
     assert 0.2 < np.std(found) / np.median(sigmas) < 1.5
 
 

@@ -158,7 +158,7 @@ def test_no_request_fails_or_returns_anything_but_the_page(
 @given(st.binary(max_size=300), st.booleans())
 @settings(max_examples=40, deadline=None)
 def test_bytes_that_are_no_request_end_in_a_closed_connection(noise: bytes, after: bool) -> None:
-    """The server neither answers with status 500 nor leaves the connection open.
+    """The server neither answers with a status of `FORBIDDEN` nor leaves the connection open.
 
     If the connection remained open, `sent` would raise `TimeoutError`.
     """
