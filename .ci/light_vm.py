@@ -5,7 +5,8 @@
 
 The script boots Debian's user-mode-linux (packages: user-mode-linux, iproute2). The root file
 system of the guest is the host's, read-only. The guest starts vcan0 and runs ``pytest -m vm
-tests/vm`` with the Python that runs this script. It can write to DIR only. DIR receives junit.xml.
+tests/vm`` with the Python that runs this script. Of the host's folders, the guest can write to DIR
+only. DIR receives junit.xml.
 
 The exit status is the status of pytest; 1 if a test was skipped or no test ran; 90 if the guest did
 not reach the end of pytest; 124 at the time limit; 2 if the machine cannot be started.

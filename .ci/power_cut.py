@@ -213,7 +213,7 @@ def judge(folder: Path, cut: CutDisk) -> bool:
     late_s = max(late_s, 0.0)
     say(
         f"{len(found)} messages in files 1 to {recording.parts[-1].info.part}, {unfinished} "
-        f"unfinished; lost {max(lost_s, 0.0):.2f} s, {gaps} gaps; stamps {late_s:.2f} s late"
+        f"unfinished; lost {max(lost_s, 0.0):.2f} s, {gaps} gaps; stamps up to {late_s:.2f} s late"
     )
     return recording.info.part == 1 and not gaps and lost_s <= LONGEST_LOSS_S + late_s
 

@@ -217,7 +217,8 @@ class Chain:
     joints: tuple[str, ...]
     segments: tuple[str, ...]
     sensors: tuple[tuple[str, ...], ...]
-    """Sensor ids of each segment, in the order of ``segments``; at least one per segment."""
+    """Sensor ids of each segment, in the order of ``segments``; at least one per segment, unless
+    the limb is planar."""
     left_side: bool = False
     """Whether the limb is on the left side, where adduction and rotation have the opposite sign
     (CONVENTIONS.md)."""
@@ -380,8 +381,8 @@ class OpticalSegment(NamedTuple):
 
     name: str
     q_world_segment: Quaternion | None
-    """Orientation measured by the cameras; None while fewer than three markers of the segment are
-    visible."""
+    """Orientation measured by the cameras; None while fewer than three markers of the segment, or
+    not its rigid body, are visible."""
     residual: float | None
     """Angle between the orientations from the IMUs and from the cameras, rad."""
     residual_rms: float | None
@@ -443,10 +444,10 @@ class RunningCenter(NamedTuple):
     position: Vector | None = None
     """Current position in the optical world, m; None while the body part is not visible."""
     shift: Vector | None = None
-    """Displacement from the calibrated center along the directions that both estimates observed,
-    m."""
+    """Displacement from the calibrated center, m, along the directions that were observed for both
+    centers."""
     p_value: float | None = None
-    """Probability of a shift of this size by chance."""
+    """Probability of a shift of this size or larger by chance."""
     moved: bool | None = None
     """Whether `p_value` is so small that the center counts as displaced; None if unknown."""
 
@@ -558,7 +559,7 @@ class StickFigure(NamedTuple):
 
 
 class MarkerFlag(StrEnum):
-    """A limitation of a chain model state; docs/mqtt.md explains each."""
+    """A fault of markers, or a limitation of a chain model state; docs/mqtt.md explains each."""
 
     LOST = "lost"
     EXCHANGED = "exchanged"

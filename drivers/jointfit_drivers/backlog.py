@@ -19,8 +19,9 @@ from __future__ import annotations
 _SKEW = 0.001
 """Margin m, as a ratio. It is twice the largest plausible skew of a device clock."""
 _BURST_SHARE = 0.5
-"""Share of the advance d of device time. A message is part of a burst if L + (1 - m) e - d is below
-zero by more than this share of d. Then the messages arrive faster than the device measures."""
+"""Share of the advance d of device time. If L + (1 - m) e - d is below zero by more than this share
+of d, the message arrived earlier than L permits. It is then part of a burst: messages arrive faster
+than the device measures, and the delay is still unknown."""
 
 
 class BacklogDelay:

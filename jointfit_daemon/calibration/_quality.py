@@ -43,8 +43,8 @@ class WorldQuality:
     correct) or ``stored`` (copied from the current calibration).
     """
     kappa: float
-    """Ratio from 0 to 1. At 1, the rotation of the world and the sensor-to-segment alignment
-    cannot be distinguished.
+    """Ratio of two singular values, 0 to 1 (`SensorAlignment.kappa`). At 1, the rotation of the
+    world and the sensor-to-segment alignment cannot be distinguished.
     """
     error_rad: float
     """Standard error of the alignment in its least observable direction."""
@@ -115,7 +115,7 @@ class ChainQuality:
     model: str
     method: str
     refused: str | None = None
-    """Reason why no marker was refined; the other fields are then None."""
+    """Reason why no marker was refined; the fields below are then None."""
     frames: int | None = None
     """Number of frames from which the markers were refined."""
     judged: int | None = None

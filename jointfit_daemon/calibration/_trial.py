@@ -1,7 +1,7 @@
 """Inputs of a calibration: recorded trials on one clock, and the settings.
 
-All time stamps are nanoseconds of the host clock CLOCK_MONOTONIC. The device clocks have already
-converted them.
+All time stamps are nanoseconds of the host clock CLOCK_MONOTONIC, converted from device time by
+``timing.clock``.
 """
 
 from __future__ import annotations

@@ -152,7 +152,7 @@ class ChainRefinementTable(Settings):
         "stops; not with method `search`",
     )
     frames: int = Field(
-        150, ge=10, le=1000, description="largest number of frames of each part, evenly spaced"
+        150, ge=10, le=1000, description="most frames to fit, and most to evaluate; evenly spaced"
     )
     first_step_mm: float = Field(8.0, ge=0.01, le=100, description="first step of `search`, mm")
     threshold_mm: float = Field(
@@ -245,7 +245,7 @@ class CalibrationTable(Settings):
         0.4,
         gt=0,
         lt=1,
-        description="last part of the functional phase, held out to evaluate the fit",
+        description="share of the functional phase, at its end, held out to evaluate the fit",
     )
     refine_markers: bool = Field(
         True,

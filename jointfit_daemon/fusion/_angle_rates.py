@@ -1,7 +1,7 @@
 """Rates of joint angles, computed as difference quotients over the last 50 ms.
 
-A shorter span would increase the noise of the rate. The rate applies to an instant 25 ms before the
-frame.
+A shorter span would increase the noise of a rate. A rate applies to the middle of its span, which
+is 25 ms before the frame at a span of 50 ms.
 
 Invariant: the cost per frame is O(1), and only frames with known angles are compared.
 """
@@ -16,7 +16,7 @@ from jointfit_daemon.model import JointAngles
 SPAN_NS = 50_000_000
 """Shortest span of a difference quotient if enough frames exist, ns."""
 MAX_GAP_NS = 120_000_000
-"""Longest time between two frames from which a rate is computed, ns."""
+"""Longest span of a difference quotient, ns."""
 
 
 class AngleRates:

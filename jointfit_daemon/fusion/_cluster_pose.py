@@ -40,7 +40,8 @@ class _MarkerSubset(NamedTuple):
     centered: list[Vector]
     """Template positions relative to the mean of these markers, m."""
     offsets: list[Vector]
-    """Vectors from the mean of these markers to the points, static world, m."""
+    """Vectors from the mean of these markers to the fixed points of `ClusterPose`, static world, m.
+    """
     moment: float
     """Sum of the squares of `centered`, m²."""
 
@@ -151,7 +152,7 @@ def _vectors(rows: Array) -> list[Vector]:
 
 
 def _columns(cluster: MarkerCluster, layout: MocapLayout) -> list[int] | None:
-    """Return the columns of a cluster, or None if the stream lacks a name of the cluster."""
+    """Return the columns of a cluster, or None if the stream lacks its body or a marker."""
     if cluster.body is not None:
         return [layout.bodies.index(cluster.body)] if cluster.body in layout.bodies else None
     if any(marker not in layout.markers for marker in cluster.markers):

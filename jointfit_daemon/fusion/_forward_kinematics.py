@@ -78,15 +78,18 @@ def joint_positions(
 ) -> list[tuple[Vector | None, float | None]]:
     r"""Return position (m) and variance per axis (m²) of every joint, from O1 to the distal end.
 
-    If joint i is the proximal end of a segment of length L and joint j its distal end,
+    Let joint i be the proximal end and joint j the distal end of a segment with the rotation matrix
+    :math:`R_i` and the length L. The standard deviations are :math:`\sigma_i` per axis of the
+    orientation, rad, and :math:`\sigma_L` of the length, m. Then
 
     .. math:: P_j = P_i - L\,R_i e_z, \qquad
               \mathrm{tr}\,\Sigma_j = \mathrm{tr}\,\Sigma_i + 2 L^2 \sigma_i^2 + \sigma_L^2
 
     For joints to the right or left of the origin of a segment, :math:`P_j = P_i \pm \frac{L}{2} R_i
     e_x`; their variance is computed from half the length and half the standard deviation of the
-    length. The propagation is of first order, with isotropic orientation errors. Both values are
-    None for all joints distal to a segment of unknown orientation or length.
+    length. O1 has the variance 0. The propagation is of first order, with isotropic orientation
+    errors. Position and variance are None for all joints distal to a segment of unknown orientation
+    or length.
 
     Parameters
     ----------
@@ -130,17 +133,19 @@ def joint_angle_estimate(
 ) -> JointAngleEstimate | None:
     r"""Return the angles of one joint, or None if an orientation is unknown.
 
-    With isotropic errors, :math:`\Sigma_{angles} = (\sigma_1^2 + \sigma_2^2)(E^T E)^{-1}`, where E
-    maps the rates of the angles to angular velocity. To first order, the standard deviation of the
-    main angle is :math:`f \sqrt{\sigma_1^2 + \sigma_2^2}`. The factor f is :math:`1 / \cos\theta`
-    for flexion with adduction (or bending) :math:`\theta`, 1 for elevation, and the factor of
-    ``read_joint`` for a tilt.
+    With isotropic errors, :math:`\Sigma_{angles} = (\sigma_1^2 + \sigma_2^2)(E^T E)^{-1}`, where
+    :math:`\sigma_1` and :math:`\sigma_2` are the standard deviations per axis of the proximal and
+    the distal segment, and E maps the rates of the angles to angular velocity. To first order, the
+    standard deviation of the main angle is :math:`f \sqrt{\sigma_1^2 + \sigma_2^2}`. The factor f
+    is :math:`1 / \cos\theta` for flexion with adduction (or bending) :math:`\theta`, 1 for
+    elevation, and the factor of ``read_joint`` for a tilt.
 
     If the standard deviation of a segment about its x axis is known, it replaces the isotropic
     value in the conventions ``flexion`` and ``trunk``. In these conventions flexion hardly depends
     on the other axes. If the value is known for both segments, :math:`2 \rho \sigma_1 \sigma_2` is
-    subtracted, where :math:`\rho` is the correlation of the model errors about x. Errors of held,
-    uncorrected or inconsistent segments are treated as independent.
+    subtracted, where :math:`\rho` is the correlation of the model errors about x. Held segments,
+    and segments without soft-tissue correction, do not have this value; their errors are treated as
+    independent. So is the error `fault_sd` of inconsistent sensors.
 
     Parameters
     ----------

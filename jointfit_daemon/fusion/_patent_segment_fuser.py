@@ -45,7 +45,7 @@ class PatentSegmentFuser(SegmentFuser):
 
     @override
     def fuse(self, t_ns: int, inputs: Inputs, neighbor: Sequence[str]) -> FusedSegment:
-        """Return the regression at `t_ns`, with the flag ``lost`` if a sensor is missing.
+        """Return the regression, or no orientation and the flag ``lost`` if a sensor is missing.
 
         A regression output with a norm below 0.5 determines no orientation, so the segment is
         ``lost`` and ``untrained``. `neighbor` is ignored, because the regression of the patent does

@@ -6,10 +6,11 @@ then None. If the set of sensors changes, the output moves from the old to the n
 within 0.25 s:
 
 - If a sensor returns, all sensors of the old set and of the new set have data, and the predictions
-  of the two sets are blended. The first sample of a returning sensor is often wrong, but the frame
-  of this sample has a small weight.
+  of the two sets are blended. The first sample of a returning sensor is often wrong, but the new
+  set has a small weight in the frame of this sample.
 - If a sensor is lost, the difference between the predictions of the two sets in the previous frames
-  is faded out. The difference in the last frame is ignored if it contradicts the frames before.
+  is faded out. The difference in the last of these frames is ignored if it contradicts the
+  differences in the frames before.
 
 Invariant: every degradation sets a flag. The orientation jumps only in the frame after a wrong
 sample.
@@ -57,7 +58,7 @@ OUTLIER = radians(3.0)
 """Limit for the last frame before a sensor was lost, rad. The rotation from the prediction of the
 remaining sensors to the output is computed in each of the last five frames. If the rotation in the
 last frame differs from the median by more than this limit, the last frame counts as wrong.
-Soft-tissue artefact causes at most a third of this difference.
+Soft-tissue artefact changes the rotation by at most a third of the limit.
 """
 _HISTORY = 5
 """Number of stored frames. The median of five frames is correct even if two frames are wrong."""
@@ -160,8 +161,8 @@ class SegmentFuser:
             Orientation q_optical_segment computed from each sensor of the limb that has data. It is
             the orientation of the segment to which the sensor is attached.
         neighbor : sequence of str
-            Sensors of the neighboring segment, whose posture is an input of the models; must not
-            change between calls.
+            Sensors of the neighboring segment, whose orientation is an input of the models; must
+            not change between calls.
         """
         before = self._before
         if before is not None and inputs.keys() == before[2].keys():

@@ -6,10 +6,10 @@ manifold,
 
 .. math:: q \leftarrow q + G^{+}\,\log(f(q)^{-1} A), \qquad G = \partial\log / \partial q
 
-:math:`G^{+}` is the pseudo-inverse of G. The covariance of the coordinates is
-:math:`G^{+} C G^{+T}`, where C is the covariance of a step of this joint. A step of the chain
-state (`chains.apply_step`) contains, for each joint, the rotation vector by which A is rotated, in
-the axes of the segment, and the translation of a free joint.
+:math:`G^{+}` is the pseudo-inverse of G. The covariance of the coordinates is :math:`G^{+} C
+G^{+T}`, where C is the covariance of a step of this joint. A step of the chain state
+(`chains.apply_step`) contains for each joint the rotation vector, in the axes of the segment, by
+which A is rotated. For a free joint it also contains the translation.
 """
 
 from __future__ import annotations

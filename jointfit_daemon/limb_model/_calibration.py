@@ -106,7 +106,10 @@ class JointCalibration:
     length), ``midpoint`` (middle between two joints) or ``unknown``.
     """
     residual_rms: float | None = None
-    """RMS residual of the distances between the markers and the center, m."""
+    """RMS residual of the center, m. It is the deviation of the distances of the markers from their
+    means. For the estimators ``score`` and ``sara``, it is the distance between the positions of
+    the center that follow from the two body parts.
+    """
     gap_rms: float | None = None
     """RMS distance over the movement between two points, m: the center as a fixed point of the
     proximal body part, and the center as a fixed point of the distal body part.

@@ -44,8 +44,8 @@ class KernelExpert:
     hull_leverage: float
     """0.995 quantile of the leverage over the training frames."""
     carried: tuple[float, ...]
-    """Sum of the weights with which the fits of all penalties are combined, for each axis, shape
-    (3,). It is the fraction of the correction that generalizes to held-out frames.
+    """Sum of the weights with which the fits of all ridge penalties are combined (stacking), for
+    each axis, shape (3,). It is the fraction of the correction that generalizes to held-out frames.
     """
 
     def correct(self, u: Array, sensors: int) -> tuple[Array, Array]:

@@ -6,9 +6,9 @@ r"""Recommended model: mean of the sensors with a posture-dependent soft-tissue 
 :math:`\bar q` is the mean of the sensors of the segment, and :math:`q_{ref}` is the optical
 reference of the training. The corrections :math:`c_a` and :math:`c_b` are two fits (`KernelExpert`)
 of :math:`\rho = \log(\bar q^* \otimes q_{ref})`. Expert a uses only relative rotations and
-generalizes to other movements. Expert b also uses the tilt of the segment and has smaller errors on
-the trained movements. The weight w of expert b is 1 in the middle of the training range, decreases
-towards the limit of this range, and is 1/2 outside.
+generalizes to other movements. Expert b also uses the tilt of the segment and has smaller errors
+than expert a on the trained movements. The weight w of expert b is 1 in the middle of the training
+range, decreases towards the limit of this range, and is 1/2 outside.
 
 Outside the training range, the factors :math:`\eta` decrease, and the linear trend T of
 `_kernel_trend` replaces the experts, because the trend extrapolates best. The factor of expert b

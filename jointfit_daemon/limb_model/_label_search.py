@@ -35,12 +35,13 @@ if TYPE_CHECKING:
     Rows = NDArray[np.intp]
 
 SUSPICIOUS_M = 0.012
-"""RMS residual of a cluster above which its labels are searched, m."""
+"""RMS residual of a cluster above which its labels are always searched, m."""
 SMALLEST_M = 0.004
 """RMS residual below which labels are never searched, m. It is the noise of markers on skin."""
 DISPLACED_M = 0.02
-"""RMS residual of a cluster above which a single marker may be displaced, m. It is the accepted RMS
-error of markers, which soft-tissue artefact does not exceed for long."""
+"""RMS residual of a cluster above which a single marker may be displaced, m. It equals
+`ACCEPTED_RMS_M` of ``kinematics.accepted_errors``; soft-tissue artefact does not exceed it for
+long."""
 _SYMMETRY = 0.6
 """RMS residual above which labels are searched, relative to the smallest RMS residual that an
 exchange within the cluster causes."""
@@ -309,7 +310,7 @@ class LabelSearch:
         """Return the best assignments of one cluster, with the unchanged labels first.
 
         Labels are added marker by marker. An assignment is dropped if the distance of two markers
-        differs from their distance in the cluster.
+        differs from their distance in the cluster by `_TOLERANCE_M` or more.
         """
         own, template, seen = self._own[p], self.clusters[p].template, frame.seen
         apart = np.sqrt(((template[:, None] - template[None]) ** 2).sum(axis=-1))

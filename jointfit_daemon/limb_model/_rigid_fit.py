@@ -1,6 +1,6 @@
 """Rigid motions of marker clusters, fitted to the visible markers of every frame.
 
-NaN marks an invisible marker, and propagates through all computations.
+NaN marks an invisible marker, which a fit ignores. The results of a frame without a fit are NaN.
 """
 
 from __future__ import annotations

@@ -47,8 +47,8 @@ class SensorLink:
     b: str
     kind: LinkKind
     near: tuple[str, ...]
-    """Sensors of the neighboring segment. The tilt of the first available sensor and the tilt of
-    `a` describe the posture.
+    """Sensors of the neighboring segment or, if there is none, of the same segment. The tilt of the
+    first available sensor and the tilt of `a` describe the posture.
     """
     weights: tuple[tuple[float, ...], ...]
     """Ten weights for each predicted component (3 for a pair, 1 for a joint)."""

@@ -19,8 +19,8 @@ _UNIT_BITS = 10
 """Number of bits by which times in ns are shifted, so that the unit of the histogram is 1024 ns. A
 shift is faster than a division."""
 _OCTAVE_BITS = 2
-"""Binary logarithm of the number of buckets per octave. With four buckets, an upper limit exceeds a
-time by at most a quarter."""
+"""Binary logarithm of the number of buckets per octave. With four buckets, the upper limit of a
+bucket exceeds the times in it by at most a quarter."""
 _BUCKETS = 100
 """Number of buckets. The last bucket contains all times of 60 s and more."""
 

@@ -82,7 +82,7 @@ def discovery_payload(rig: Rig) -> dict[str, Any]:
 
 
 def _angles(rig: Rig) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield entities for the angles of each inner joint and their standard deviation."""
+    """Yield entities for the angles of each joint between two segments, and for their sd."""
     if rig.chain.planar:  # A planar chain is published as optical/sticks, without angles.
         return
     for joint in inner_joints(rig.chain):

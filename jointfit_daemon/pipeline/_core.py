@@ -333,7 +333,7 @@ class Core:
                 outputs += self._report(source, state, item)
                 continue
 
-            if state.open and not state.online:  # the last output of a closed decoder has no effect
+            if state.open and not state.online:  # a closed decoder's last samples: stays offline
                 state.online = True
                 outputs.append(DeviceStatus(source, online=True))
                 outputs.append(Notice(self._now_ns, NoticeKind.DEVICE, source, "streaming"))

@@ -2,9 +2,10 @@
 
 The monitor is used for rigs without a chain model. It compares the markers with the marker clusters
 of the current calibration. A cluster is the arrangement of the markers on one body part. Markers
-with faulty labels are hidden from fusion until they fit the clusters again. Invariant: a fault is
-reported when it has explained most frames of 2 s. Its end is reported after 2 s without this fault.
-Hidden markers neither begin nor end a fault.
+fit a cluster if their RMS residual is at most `MAX_FIT_RMS_M`. Markers with faulty labels are
+hidden from fusion until they fit the clusters again. Invariant: a fault is reported when it has
+explained most frames of 2 s. Its end is reported after 2 s without this fault. Hidden markers
+neither begin nor end a fault.
 """
 
 from __future__ import annotations
@@ -55,8 +56,8 @@ frames."""
 _ABSENT = 0.1
 """Largest share of frames in which a fault or misfit may still occur when its end is reported."""
 _REFUSED = 0.8
-"""A misfit of a body part is reported if the markers of the part do not fit its cluster in this
-share of the frames in which the markers are visible."""
+"""A misfit of a body part is reported if the markers of the part do not fit its cluster in at least
+this share of the frames in which enough of the markers are visible."""
 
 
 class _Examined(NamedTuple):

@@ -4,8 +4,8 @@ The consumers are the calibration, the lag monitor, online learning, and the com
 center of the first joint.
 
 Invariant: every frame is counted once, as used or idle. Only live frames are used, not frames of a
-recording that the camera server plays back. Frames are combined with sensor data only if their
-stamp is synchronized to the host clock.
+recording that the camera server plays back. The calibration, the lag monitor and online learning
+receive a frame only if its stamp is synchronized to the host clock. O1 needs no synchronization.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Continuous estimates of joint centers after calibration, and a test of their shift.
 
-Invariant: only live mocap frames change the estimates, and limb states do not depend on them.
+Invariant: only live mocap frames change the estimates, and limb states do not depend on the
+estimates.
 """
 
 from __future__ import annotations

@@ -37,7 +37,8 @@ class Configured:
     t_ns: int
     rig: Rig
     calibration: Calibration | None
-    """Newest stored calibration of the rig."""
+    """Calibration to use: the newest stored one, or a newer one that is not written yet; None
+    without a calibration."""
     calibration_version: int | None = None
     calibration_age_s: float = 0.0
     """Time since the calibration was stored, s. The heading uncertainty grows with this time."""

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.lag import TrackedLag
 
 MOST_LOST = 0.01
-"""Share of lost or corrupt samples above which a device is reported as faulty."""
+"""Largest share of lost samples without a warning. The self-test also counts runs of corrupt
+bytes."""
 
 
 @dataclass(slots=True)

@@ -1,8 +1,8 @@
 """Processing of recorded events in a new core, with optional changes of rig, calibration or fits.
 
 Invariant: without changes, the core receives exactly the recorded events, so its outputs equal the
-outputs of the daemon, byte for byte. With changes, the fits of calibrations are computed again, and
-the core receives none of the recorded events with results of fits.
+outputs of the daemon, byte for byte. With changes, the core receives none of the recorded results
+of fits. The fits are computed again, or omitted if the changes contain a calibration.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Collection of the measurements and outputs of a core as arrays of a session.
 
 All series use the clock of the cameras. For this purpose, the lag of each sensor is subtracted from
-its timestamps. The lags come from the calibration in use at the end of the session. Rows that are
-not later than the previous row are omitted, because a clock that settles or restarts may step back.
+its timestamps. The lags are those in use at the end of the session, from the calibration or from
+rig.toml. Rows that are not later than the previous row are omitted, because a clock that settles or
+restarts may step back.
 """
 
 from __future__ import annotations

@@ -7,7 +7,8 @@ Zeni et al. (2008) detect the same instant with markers. A cycle extends from on
 the next.
 
 Invariant: cycles do not overlap, contain no gap of the series, and belong to a run of at least
-`LEAST_CYCLES`. If the movement is not walking, the result contains a reason instead of cycles.
+`LEAST_CYCLES` successive cycles of similar duration. If the movement is not walking, the result
+contains a reason instead of cycles.
 """
 
 from __future__ import annotations

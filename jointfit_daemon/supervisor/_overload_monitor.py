@@ -17,7 +17,8 @@ STALL_S = 0.5
 STALL_REPEAT_S = 60.0
 """Shortest interval between two warnings about stalls, s."""
 DROPPED_SHARE = 0.2
-"""Share of dropped MQTT messages in one health interval above which the daemon is overloaded."""
+"""Largest tolerated share of dropped messages among the sent and dropped MQTT messages of one
+health interval."""
 FEWEST = 20
 """Smallest number of messages in one health interval for which the share is evaluated."""
 REPEAT_S = 300.0

@@ -89,8 +89,8 @@ class RequestHandlers:
     async def reload(self, request: Request) -> Reply | None:
         """Load rig.toml again. If the file is faulty, the error lists all its faults.
 
-        If the file selects another broker or base topic, the answer ``accepted`` is published
-        before the daemon changes the connection.
+        If the table ``[mqtt]`` has changed, the answer ``accepted`` is published before the daemon
+        connects again.
         """
 
         def data(rig: Rig) -> dict[str, object]:
@@ -155,8 +155,8 @@ class RequestHandlers:
     async def use_calibration(self, request: Request) -> Reply | None:
         """Load a stored version and pass it to the core, which sends the answer."""
         # A new calibration has no version number until its file is written. Without a number,
-        # `before` searches all files. If the file were written just before this search, a request
-        # to revert would find it, and would select the calibration that it should replace.
+        # `before` returns the newest file. If the new calibration were written just before this
+        # search, a request to revert would select the calibration in use, not an earlier one.
         await self._daemon.settle_store()
         rig, in_force = self._daemon.rig, self._daemon.health().core.version
         version = request.arguments.get("version")

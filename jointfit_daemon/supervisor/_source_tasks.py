@@ -2,8 +2,8 @@
 
 Invariant: a source is opened in the core with its first chunk and closed when its driver ends. No
 source stops permanently. A misconfigured source is retried when another device appears on its port,
-at a reload, and after one minute at the latest. Any other exception of a driver is a bug and ends
-the daemon.
+at a reload, and after one minute at the latest. An exception of a driver that reports neither a
+lost nor a misconfigured device is a bug and ends the daemon.
 """
 
 from __future__ import annotations

@@ -103,9 +103,9 @@ log = logging.getLogger(__name__)
 CHECK_S = 0.1
 """Interval between checks of the event loop's delay and of due health messages, s."""
 HEALTH_SOON_S = 0.5
-"""Delay of the health message after a device was lost or found, or a recording began, s."""
+"""Delay of the health message after a device was lost or found, or a notice of the recording, s."""
 KNOWN_S = 2.0
-"""Longest wait after the start for the first data of a silent source, s."""
+"""Longest time that a source without data delays the readiness report to systemd, s."""
 FAREWELL_S = 0.5
 """Longest wait until the broker accepts the last messages, s."""
 _STORING = ("calibrate", "static", "use-calibration")
@@ -453,8 +453,8 @@ class Daemon:
         Parameters
         ----------
         before_move
-            Function that is called with the new rig if this rig has another broker or base topic.
-            It is called before the current connection ends.
+            Function that is called with the new rig if its table ``[mqtt]`` has changed. It is
+            called before the current connection ends.
 
         Returns
         -------

@@ -42,8 +42,8 @@ def state_directory() -> Path:
 def lock_state(directory: Path) -> int | None:
     """Lock `directory` for this process, and return the descriptor that owns the lock.
 
-    Return None if no lock file can be created. A directory without write access contains no state
-    to protect. On network file systems without locks, the descriptor of the file is returned
+    Return None if no lock file can be created, because this process then cannot write to the
+    directory either. On network file systems without locks, the descriptor of the file is returned
     without a lock.
 
     Raises

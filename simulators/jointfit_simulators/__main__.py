@@ -128,7 +128,7 @@ def _add_play_options(play: argparse.ArgumentParser) -> None:
     play.add_argument("--rate", type=float, help="IMU samples per second")
     play.add_argument("--seed", type=int, help="random seed")
     play.add_argument("--command-port", type=int, metavar="PORT",
-                      help="UDP port of the motion-capture server (default: the port of the "
+                      help="port of the motion-capture server (default: the port of the "
                       "previous run in this directory, otherwise any free port)")  # fmt: skip
     play.add_argument("--follow", action="store_true",
                       help="select the motion by the daemon's calibration phase: align, static, "

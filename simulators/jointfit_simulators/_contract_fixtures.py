@@ -80,7 +80,7 @@ class DecodingReceiver:
         self.events += self.decoder.feed(chunk)
 
     async def wait_for(self, count: int, within_s: float) -> None:
-        """Wait until `count` measurements have arrived; the time limit is `within_s`."""
+        """Wait until `count` measurements have arrived, but at most `within_s`, s."""
         for _ in range(round(within_s / _POLL_S)):
             if len(self.measurements) >= count:
                 return

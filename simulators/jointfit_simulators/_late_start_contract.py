@@ -26,10 +26,10 @@ class LateStartContract:
     """Whether a sample depends on many earlier samples, for example through a filter."""
 
     def test_a_decoder_that_starts_later_needs_the_description(self: Any, tmp_path: Path) -> None:
-        """A decoder that receives the description first returns all samples of a later stream.
+        """A decoder that starts late returns all samples, if it first receives the description.
 
-        The description is the attribute `description` of the decoder: the newest messages on which
-        the decoding of the data depends.
+        The description is the attribute `description` of the first decoder: the newest messages on
+        which the decoding of the data depends. See `decode_later` for decoders without it.
         """
         if self.has_history:
             raise SkipTest("the orientation filter begins again")

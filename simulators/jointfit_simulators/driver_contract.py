@@ -141,7 +141,7 @@ class DriverContract(LateStartContract, ABC):
     # --- tests --------------------------------------------------------------------------------
 
     def test_settings_are_frozen_and_reject_unknown_keys(self, tmp_path: Path) -> None:
-        """A misspelled key of rig.toml is an error."""
+        """Settings are immutable, and a misspelled key of rig.toml is an error."""
         kind = type(self.make_driver(tmp_path))
         require(issubclass(kind.Settings, Settings), "Settings must derive from driver.Settings")
         require(kind.Settings.model_config.get("frozen") is True, "Settings must be frozen")
@@ -192,7 +192,10 @@ class DriverContract(LateStartContract, ABC):
         asyncio.run(scene())
 
     def test_samples_do_not_depend_on_the_split_of_the_stream(self, tmp_path: Path) -> None:
-        """Single bytes and one large chunk yield the same samples. Datagrams are not split."""
+        """One chunk, and single bytes of a stream, yield the same samples as the original chunks.
+
+        CAN frames are not split. Datagrams are neither split nor joined.
+        """
 
         async def scene() -> None:
             device, driver = self.make_device(tmp_path, clean_wire), self.make_driver(tmp_path)
@@ -240,7 +243,7 @@ class DriverContract(LateStartContract, ABC):
         asyncio.run(scene())
 
     def test_arrival_stamps_are_those_of_the_first_byte(self, tmp_path: Path) -> None:
-        """The arrival time of a message follows from the number of later bytes in its chunk."""
+        """The arrival of a sample is that of the first byte, also within a chunk of many bytes."""
 
         async def scene() -> None:
             driver, data, t_ns, _ = await self._record(tmp_path)
@@ -274,7 +277,7 @@ class DriverContract(LateStartContract, ABC):
         asyncio.run(scene())
 
     def test_silence_discards_an_incomplete_message(self, tmp_path: Path) -> None:
-        """The decoder discards an incomplete message after a long silence."""
+        """A long silence discards an incomplete message; a short pause does not."""
 
         async def scene() -> None:
             driver, data, t_ns, whole = await self._record(tmp_path)
@@ -325,7 +328,7 @@ class DriverContract(LateStartContract, ABC):
         asyncio.run(scene())
 
     def test_random_bytes_never_raise(self, tmp_path: Path) -> None:
-        """Corrupt bytes yield events, and the number of pending bytes is bounded."""
+        """Random bytes raise no error; at most the received bytes are counted as corrupt."""
         noise = random.Random(11)  # noqa: S311 - the same bytes in every run
         decoder = self.make_driver(tmp_path).decoder()
         fed = lost = 0
@@ -343,7 +346,7 @@ class DriverContract(LateStartContract, ABC):
         )
 
     def test_line_noise_affects_only_damaged_samples(self, tmp_path: Path) -> None:
-        """The driver continues; undamaged samples arrive, and damaged samples are rejected."""
+        """On a noisy line, at least half of the samples arrive, and all of these are unchanged."""
         if not self.has_noise:
             raise SkipTest("this wire detects damage itself, or does not allow its detection")
 
@@ -428,7 +431,7 @@ class DriverContract(LateStartContract, ABC):
         asyncio.run(scene())
 
     def test_wrong_device_raises_device_misconfigured(self, tmp_path: Path) -> None:
-        """If a retry cannot help, the driver raises an error with a message for the user."""
+        """With a device of another type, the driver raises an error with a message for the user."""
         device = self.make_wrong_device(tmp_path)
         if device is None:
             raise SkipTest("this wire does not allow detection of a wrong device")
@@ -462,7 +465,7 @@ class DriverContract(LateStartContract, ABC):
         asyncio.run(scene())
 
     def test_cancelling_closes_all_descriptors_and_tasks(self, tmp_path: Path) -> None:
-        """After ``run`` is cancelled at any stage, no descriptor is open and no task runs."""
+        """If ``run`` is cancelled at its start or while reading, no descriptor or task remains."""
 
         async def scene() -> None:
             device, driver = self.make_device(tmp_path, clean_wire), self.make_driver(tmp_path)

@@ -27,7 +27,7 @@ class ImuDevice(Protocol):
 
     @property
     def streaming(self) -> bool:
-        """Whether the device is in measurement mode, or on CAN, whether its bus is open."""
+        """Whether the device is in measurement mode; on CAN, whether its bus is open."""
 
     @property
     def rate_hz(self) -> float:

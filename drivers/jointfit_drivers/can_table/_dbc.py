@@ -162,7 +162,7 @@ def _multiplexer(message: Any, signal: Any) -> Multiplexer | None:
     Raises
     ------
     FieldFaultError
-        The multiplexer has too few bits for any of the values.
+        The multiplexer has too few bits for every one of the values.
     """
     if signal.multiplexer_ids is None:
         return None

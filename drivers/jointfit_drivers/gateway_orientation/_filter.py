@@ -21,9 +21,9 @@ has detected rest or has run for `SETTLE_S`, or for ``settle_s`` if this time is
 
 With a magnetometer, `StartEstimator` then estimates orientation and gyroscope bias from the
 readings since the start, and continues with every reading. Orientations are returned when their
-standard deviation is at most `SETTLED_SD`, or after ``settle_s``. The estimation ends at the first
-rest, when the standard deviation of the bias is at most `KNOWN_BIAS_SD`, or after `CONVERGE_S` at
-the latest. Its result is then copied to VQF.
+standard deviation is at most `SETTLED_SD`, or after ``settle_s``. The estimation ends as soon as
+rest is detected or the standard deviation of the bias about every axis is at most `KNOWN_BIAS_SD`,
+and after `CONVERGE_S` at the latest. The result of the estimation is then copied to VQF.
 
 A magnetometer has a delay relative to the gyroscope. For the IMU of the BROAD data set, the delay
 is 13 ms. This delay causes an error of 8 degrees at an angular rate of 579 degrees per second. The
@@ -88,8 +88,8 @@ FIELD_RATIO = 2.0
 """Largest factor between the field strength and its median, in either direction, at which a reading
 is used to estimate the delay of the magnetometer."""
 RIDGE_RATE = 1.0
-"""Angular rate below which the delay of the magnetometer is not estimated, rad/s. At this rate, a
-delay of 20 ms changes the field by at most 2 %."""
+"""RMS angular rate, perpendicular to the field, below which the delay of the magnetometer is not
+estimated, rad/s. At this rate, a delay of 20 ms changes the field by 2 %."""
 MOST_DELAY_S = 0.05
 """Largest delay of the magnetometer, s."""
 NO_FIELD = (0.0, 0.0, 0.0)

@@ -49,8 +49,8 @@ _GAP_PERIODS, _LEAST_GAP_NS = 5, 100_000_000
 values, samples were lost. If a program stamps samples at transmission, the stamps have a jitter of
 several periods."""
 _REPEATED = 50
-"""Number of repeated stamps that causes a warning. A stamp is repeated if it equals the stamp of
-the previous sample."""
+"""Number of repeated stamps at which a warning is returned if most stamps are repeated. A stamp is
+repeated if it equals the stamp of the previous sample."""
 _EARLY_NS, _LATE_NS = 500_000_000, 10 * NS_PER_S
 """Largest times by which a stamp on the LSL clock may be later and earlier than its arrival, ns."""
 

@@ -1,8 +1,8 @@
 """Bitstream version of one NatNet server. The version defines the binary layout of the messages.
 
-A version that the server announces is a candidate. The candidate is used from the first frame or
-model that decodes exactly with the candidate, but not with the version in use. A forged
-announcement therefore changes nothing.
+A version that the server announces is used at once if no supported version is in use. Otherwise it
+is a candidate. A candidate is used from the first frame or model that decodes exactly with the
+candidate, but not with the version in use. A forged announcement then changes nothing.
 
 Invariant: the module is pure.
 """

@@ -41,7 +41,8 @@ _ECHO_LIMIT_NS = 10**9
 """Largest round-trip time of an echo that is used for the clock, ns."""
 _PENDING_ECHOES = 8
 _NAMED_UNKNOWN = 16
-"""Largest number of unknown ids in warnings. Further ids are only counted."""
+"""Largest number of unknown ids in one warning. After this number of unknown ids, further ids are
+only counted."""
 _MOST_SECONDS = 2**63 // 10**9
 """Largest accepted stamp, s. Its value in nanoseconds fits into 64 bits."""
 _ANNOUNCED = {

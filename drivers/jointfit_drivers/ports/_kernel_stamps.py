@@ -34,8 +34,7 @@ class KernelStamps(WallClock):
         """Return the start of a frame of `size` bytes, ns, from its kernel stamp `unix_s`.
 
         The start is ``t_end - frame_bits(size, extended) / bitrate``. ``t_end`` is the stamp, or
-        the current time if the stamp is in the future. A stamp that is more than 2 s in the past,
-        or more than 1 ms in the future, is replaced by the current time.
+        the current time if the stamp is in the future or more than 2 s in the past.
         """
         # The limit is the current time, not the time of the wake-up. Otherwise frames that arrive
         # while this process is delayed would be stamped too early.

@@ -69,7 +69,7 @@ class _Subscriber:
     silence_s: float
     needed: CanKey
     others: int
-    """Number of frames of all devices that had arrived before the subscription."""
+    """Number of frames of the rig's devices that had arrived before the subscription."""
     arrived: dict[CanKey, int] = field(default_factory=dict)
     """Time of the last arrival of each subscribed identifier since the subscription, ns."""
     timer: SilenceTimer | None = None
@@ -118,7 +118,7 @@ class SharedBus:
         self._backend: SlcanBus | PythonCanBus | None = None
         self._failed: Exception | None = None
         self._unclaimed: deque[tuple[int, CanFrame]] = deque(maxlen=_UNCLAIMED)
-        self._others = 0  # frames delivered to devices of the rig
+        self._others = 0  # frames of the rig's devices, including devices that wait for a retry
         self._seen: dict[CanKey, deque[bytes]] = {}  # last data of unclaimed identifiers
         self._lock = asyncio.Lock()  # opening and closing take time and must not overlap
         self.users = 0

@@ -37,20 +37,21 @@ class QtmBinding:
     """For each marker column, the index of the marker in the 3D component (the part of a frame with
     the markers)."""
     body_keys: tuple[int, ...]
-    """For each body column, the index of the body in the 6D component (the part of a frame with the
-    bodies), or the `segment_key` of a skeleton segment."""
+    """For each body column, the index of the body in QTM's settings, or the `segment_key` of a
+    skeleton segment."""
     labels: int
-    """Number of labeled markers."""
+    """Number of labeled markers in QTM's settings."""
     bodies: int
-    """Number of 6DOF bodies."""
+    """Number of 6DOF bodies in QTM's settings, whether enabled or not."""
     enabled: tuple[int, ...]
-    """Indices of the enabled bodies."""
+    """Indices of the enabled bodies in QTM's settings."""
     skeletons: int
 
     def body_places(self, count: int) -> tuple[int, ...] | None:
-        """Return the number of the body at each index of a component with `count` bodies.
+        """Return the index in QTM's settings of each body of a 6D component with `count` bodies.
 
-        Return None if the component does not fit the settings.
+        The 6D component is the part of a frame with the bodies. It contains all bodies of the
+        settings or only the enabled ones. Return None if `count` is neither of these numbers.
         """
         if count == self.bodies:
             return tuple(range(count))

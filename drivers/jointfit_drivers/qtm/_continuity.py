@@ -17,8 +17,8 @@ from jointfit_drivers.motion_capture import FrameStep
 _REORDERED_US = 200_000
 """Largest decrease of the stamp in a reordered datagram, µs."""
 _LATE_RUN = 10
-"""Number of consecutive frames with a decreased stamp after which they count as a short recording
-in a loop, not as reordered datagrams."""
+"""Number of consecutive frames with a decreased stamp from which the frames count as a short
+recording in a loop, not as reordered datagrams."""
 _STEPS = 20
 """Number of recent steps of the frame number. The smallest of them is the usual step."""
 _MOST_LOST = 100_000

@@ -25,7 +25,8 @@ log = logging.getLogger(__name__)
 _UNKNOWN_BYTES = 4096
 """Number of bytes without a message after which the table counts as wrong."""
 _UNKNOWN_S = 2.0
-"""Time with received bytes but without a message after which the table counts as wrong, s."""
+"""Time since the first byte after which the table counts as wrong if no message with measurements
+has arrived, s."""
 _RAW_CHUNKS = 20
 """Number of chunks logged at debug level, so that the log contains raw data of a device."""
 

@@ -162,7 +162,7 @@ def _length_finding(
     if count < _SHARE * len(whole) or value + wire.length_adds == spacing:
         return None
     remedy = f"set `frame.length_field.adds` = {spacing - value}"
-    return f"frames of {spacing} bytes have the length {value}: {remedy}"
+    return f"the length field of frames of {spacing} bytes contains {value}: {remedy}"
 
 
 def _is_valid(frame: bytes, checksum: Checksum, wire: FrameFormat) -> bool:

@@ -5,7 +5,7 @@ values), and P is the measured sample period:
 
 | finding                                                  | outcome                          |
 |----------------------------------------------------------|----------------------------------|
-| c = round(d / P) within 1 % and two counts               | same clock; c - 1 samples lost   |
+| c and n = round(d / P) differ by at most 2 + n / 100     | same clock; c - 1 samples lost   |
 | no counter; d is not negative, and is at most 100 P or   | same clock; round(d / P) - 1     |
 | about equal to the step of the arrival times             | samples lost                     |
 | no time; c is not negative, and fits the arrival times   | c - 1 samples lost               |

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 _STEPS = 300
 """Number of steps (pairs of successive readings) between two computations of the slope."""
 _MOST_STEPS = 6000
-"""Number of steps after which the check ends if the sensor hardly rotated."""
+"""Number of steps after which the check ends without a result, for example because the sensor
+hardly rotated."""
 _EXPLAINED = 0.5
 """Smallest share of the squared differences that the regression must explain."""
 _LOW, _HIGH = 0.6, 1.7
@@ -85,7 +86,10 @@ class RateUnitCheck:
                 self.slope = slope
 
     def fitting_unit(self, configured: float) -> str | None:
-        """Return the unit for which k is near 1; `configured` is the configured unit in rad/s."""
+        """Return the unit that brings k into range; None if there is none.
+
+        `configured` is the SI value of the configured unit.
+        """
         if self.slope is None:
             return None
         for unit, si in UNITS["rate"].items():

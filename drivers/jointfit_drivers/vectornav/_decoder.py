@@ -46,7 +46,8 @@ _FIELDS = (int(Field.IMU_MAGNETIC_FIELD), int(Field.MAGNETIC_AND_PRESSURE))
 _NAMES = {Register.MODEL: "model", Register.SERIAL: "serial", Register.FIRMWARE: "firmware"}
 _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _SMALL = 1e-4
-"""Largest difference between a rotation matrix and the identity that counts as no rotation."""
+"""Largest difference between an element of a rotation matrix and of the identity that counts as no
+rotation."""
 _NEWEST = NewestKnown((3,), "VectorNav Control Center")
 """Newest supported firmware: the version of the VN-100 in 2024. Other models have lower
 versions."""

@@ -63,7 +63,7 @@ class ViconDecoder:
         self._continuity = FrameContinuity()
         self._latency = AnnouncedLatency()
         self._described: dict[frozenset[type], bytes] = {}
-        """Newest packet with each combination of static objects."""
+        """Newest packet with each combination of types of static objects."""
         self._binding: ViconBinding | None = None
         self._period: int | None = None
         self._poor: set[int] = set()

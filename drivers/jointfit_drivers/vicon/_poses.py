@@ -141,7 +141,7 @@ def _chained_poses(
 
 
 def _chain(number: int, local: dict[int, Pose], parents: dict[int, int]) -> Pose | None:
-    """Return the global pose of a segment; None if one of its parents is missing."""
+    """Return the global pose of a segment; None if an ancestor is missing, or in a loop."""
     pose = local.get(number)
     for _ in range(_DEEPEST):
         number = parents.get(number, 0)

@@ -2,9 +2,9 @@
 
 VRPN has no frames: every body has its own messages, and a body that is not visible has none. The
 reports of one frame have nearly equal times. A frame ends in three cases: every expected body has
-reported, a body reports again, or a report is half a period later than the first report. A body
-that stops reporting is expected for three more periods, and for at least 100 ms. In a frame without
-its report, the body is missing.
+reported, a body reports again, or the time of a report differs from the time of the first report by
+more than half a period. A body that stops reporting is expected for three more periods, and for at
+least 100 ms. In a frame without its report, the body is missing.
 
 Invariant: the module is pure. The result depends only on the reports, not on their arrival. A frame
 contains each body at most once.

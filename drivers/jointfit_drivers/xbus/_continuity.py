@@ -1,7 +1,7 @@
 """Counter and clock of an Xbus device: losses, restarts, and corruption that passed the checksum.
 
 An orientation *follows* another orientation if counter and device time advanced together. If only
-one of them is sent, it must have advanced by at most a few periods. Every MTData2 message
+one of them is sent, its step must correspond to at most a few messages. Every MTData2 message
 increments the counter. Only messages with an orientation are compared, because other messages may
 contain the time of another clock (GNSS).
 
@@ -13,12 +13,14 @@ contain the time of another clock (GNSS).
 | the next follows the held one                 | both accepted; a restart if device time agrees  |
 |                                               | neither with the counter nor with the arrivals, |
 |                                               | and no backlog explains it; a counter jump if   |
-|                                               | time advanced by one period                     |
+|                                               | time advanced by one period; without device     |
+|                                               | time, a restart if the counter decreased        |
 | the next follows neither                      | the held one is dropped, the next one is held   |
 
 The eight-bit checksum accepts one corrupt message in 256, so a single message proves neither a loss
-nor a restart. The number of counts expected from the time and the measured rate may differ from the
-counted number by 2 % plus four, modulo 65536. The nominal rate is used only for the first samples.
+nor a restart. The expected number of counts follows from the time and the measured rate. It may
+differ from the counted number by four plus 2 % of the expected number, modulo 65536. The nominal
+rate is used only for the first samples.
 
 Invariant: the result depends only on the values fed, and every input is accepted.
 """
@@ -48,9 +50,10 @@ backlog, ns."""
 _LATEST_NS = 30_000_000_000
 """Longest delay of the first messages after the port is opened, ns."""
 _DISTINCT = 50_000
-"""Longest gap in which a contradiction between counter and time can be detected, counts.
+"""Longest gap over which counter and time are compared, counts.
 
-After a longer gap, the permitted difference includes any pair of counter and time."""
+The permitted difference grows with the gap. After a very long gap, it would include any pair of
+counter and time."""
 
 
 class XbusStep(NamedTuple):

@@ -102,10 +102,11 @@ class XbusConversation:
         wait_s : float
             Interval between requests while the device sends nothing, s.
         late_s : float
-            Permitted delay of an acknowledgement, s. If it is positive and the device sends data,
-            only one request is pending at a time, at intervals of `OUTSTANDING_S`.
+            Wait for an acknowledgement in addition to ``tries * wait_s`` if the device sends data,
+            s. If this wait is positive and the device sends data, only one request is pending at a
+            time, at intervals of `OUTSTANDING_S`.
         late_if_silent : bool
-            Whether `late_s` also applies while the device sends nothing.
+            Whether to wait `late_s` also if the device sends nothing.
 
         Returns
         -------

@@ -6,7 +6,7 @@ of SampleTime per group:
 
 | finding                                                 | outcome                             |
 |---------------------------------------------------------|-------------------------------------|
-| c = round(d / P) within 1 % and two counts              | same clock; c - 1 groups were lost  |
+| c and n = round(d / P) differ by at most 2 + n / 100    | same clock; c - 1 groups were lost  |
 | no counter, d forward by a few P                        | same clock; round(d / P) - 1 lost   |
 | d or c backward, only one of them 0, or they disagree   | contradiction: the group is held    |
 | the next group continues the held one                   | restart, unless SampleTime          |
@@ -47,8 +47,8 @@ _RAN_ON_SHARE = 0.1
 _LATEST = 3000
 """Longest delay of the first groups after the bus is opened, groups."""
 _LONGEST = 20_000
-"""Longest accepted gap, groups. After a longer gap, the tolerance would include any pair of
-values."""
+"""Longest accepted gap, groups. The tolerance grows with the gap. After a very long gap, it would
+include any pair of values."""
 _BLIND = 100
 """Longest gap that is accepted from the time alone if the next group confirms it, groups."""
 _WINDOW = 20

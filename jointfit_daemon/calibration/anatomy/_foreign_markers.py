@@ -1,8 +1,8 @@
 """Search for markers that do not move with their body part during a movement.
 
-If a label or a list of markers in rig.toml was already wrong in the static pose, the markers agree
-with the static pose, but one marker of a body part is on another body part. The movement shows this
-fault. Two measures are compared with the range of soft-tissue artefact:
+A label, or a list of markers in rig.toml, may already be wrong in the static pose. One marker of a
+body part is then on another body part, although all markers agree with the static pose. The
+movement shows this fault. Two measures are compared with the range of soft-tissue artefact:
 
 - the change of the distance of two markers of the part, and
 - the movement of a marker in the frame of the other markers. A marker near the joint of two parts
@@ -42,15 +42,15 @@ MOST_DISTANCE_CHANGE_M = 0.04
 """Upper quartile of the change of a distance above which two markers are on different parts, m. It
 is the change for two markers with independent artefacts of 30 mm."""
 _ELSEWHERE = 0.5
-"""Largest movement in the frame of another part, relative to the movement in the own part, with
-which a marker counts as a marker of the other part."""
+"""Ratio of the movement of a marker in the frame of another part to its movement in the frame of
+its own part. Below this ratio, the marker counts as a marker of the other part."""
 _SIMILAR = 2.0
 """Largest ratio of the movement in the frame of a part to the smallest movement in the frame of any
 part. Up to this ratio, the marker may be on the part, and the report names the part too."""
 _SAMPLED = 1500
 """Largest number of frames that are examined."""
 _FEWEST = 100
-"""Smallest number of examined frames in which a movement is visible."""
+"""Smallest number of examined frames with visible markers from which a movement is computed."""
 
 
 class ForeignMarker(NamedTuple):
@@ -62,7 +62,9 @@ class ForeignMarker(NamedTuple):
     others: tuple[str, ...]
     """Markers of the part relative to which the marker moves."""
     rms: float
-    """RMS movement relative to these markers, m."""
+    """RMS movement relative to these markers, m. If they do not determine a frame, it is the RMS
+    change of the distance that changes most.
+    """
     elsewhere: tuple[str, ...]
     """Body parts with one of which the marker moves; empty if no part was found."""
 

@@ -1,4 +1,4 @@
-"""Joint centers from the markers of one body part relative to its neighbor.
+"""Joint centers from the movement of a body part relative to the neighboring part.
 
 Every fit returns a `CenterEstimate` with `leverage`. Its `unseen` directions are the directions in
 which the movement did not determine the center. For example, the movement of a hinge does not

@@ -6,8 +6,8 @@ static pose. A pose maps static-world points to their current positions,
     x(t) = R(t) (x_static - origin) + p(t),
 
 so that R is the identity and p the origin in the static pose. All body parts therefore share one
-coordinate system in the static pose. NaN marks an invisible marker, and propagates through all
-computations.
+coordinate system in the static pose. NaN marks an invisible marker, and the pose of a part in a
+frame without a fit.
 """
 
 from __future__ import annotations

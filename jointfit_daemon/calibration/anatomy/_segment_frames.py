@@ -5,9 +5,9 @@ pose. All body parts therefore have the same coordinate system. The z axis of a 
 its distal to its proximal joint center. The x axis points to the right of the subject along the
 flexion axis, and y = z × x. The origin is the proximal joint center. A segment with two distal
 joints, such as the pelvis of both legs, is an exception. Its x axis passes through both joints,
-from left to right, and its origin is between them. With static axes, all segments have the axes of
-the world in the static pose. Quantities that could not be determined are None, and `notes` contains
-the reasons.
+from left to right, and its origin is between them. If ``Chain.static_axes`` is set, all segments
+have the axes of the world in the static pose. Quantities that could not be determined are None, and
+`notes` contains the reasons.
 """
 
 from __future__ import annotations

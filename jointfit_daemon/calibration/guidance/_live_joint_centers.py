@@ -11,8 +11,9 @@ larger arc, because a larger arc increases the matrix in brackets:
 where :math:`v_j` is marker j in coordinates of the proximal part, :math:`R_j` its distance from the
 center, and :math:`n_j` its number of frames. :math:`\sigma_r` is `RADIAL_ARTEFACT_SD_M` and
 :math:`\sigma_s` is `SKIN_SD_M` of `calibration.anatomy`. The fit after the movement uses the same
-values and therefore predicts the same soft-tissue error. This fit has a smaller random error,
-because it compares the poses of both body parts instead of fitting spheres.
+values and therefore predicts the same soft-tissue error. This fit has a smaller random error than
+the estimate during the movement, because it compares the poses of both body parts instead of
+fitting spheres.
 """
 
 from __future__ import annotations

@@ -56,8 +56,8 @@ MIN_BENDS = 12
 squats contains this number.
 """
 MIN_SEEN = 0.5
-"""Smallest fraction of the frames in which a body part is visible. With fewer frames the fit would
-be rejected.
+"""Smallest fraction of the frames in which a body part is visible. With a smaller fraction the fit
+after the movement would be rejected.
 """
 MAX_MISFITS = 0.1
 """Fraction of frames with displaced markers above which the operator is informed."""

@@ -56,7 +56,8 @@ FEWEST_POSES = 9
 FEWEST_SKEWED = 12
 """Fewest poses of a fit that includes the non-orthogonality."""
 LARGEST_SKEW_SD = 0.003
-"""Largest standard deviation, rad, with which an off-diagonal element is used."""
+"""Largest standard deviation of any off-diagonal element, rad, with which these elements are used.
+"""
 LARGEST_RESIDUAL = 0.1
 """Largest RMS of the corrected magnitudes minus g, m/s^2."""
 LARGEST_BIAS = 3.0

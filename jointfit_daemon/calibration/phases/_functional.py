@@ -94,7 +94,7 @@ if TYPE_CHECKING:
 MIN_SEEN = 0.5
 """Smallest fraction of frames in which a body part must be visible."""
 PLATE_SD_NS = 500_000.0
-"""Assumed standard deviation of a lag from the align phase if the phase did not estimate it, ns."""
+"""Assumed standard deviation of a lag from the align phase for which the phase stored none, ns."""
 STORED_SD_NS = 3e6
 """Standard deviation of a lag from the current calibration, ns. Such a lag may contain an error
 from soft-tissue artefact.
@@ -136,7 +136,7 @@ def fit_calibration(
         Configured lags by sensor, ns. The lags of other sensors are estimated.
     tracked : mapping, optional
         Lags and standard deviations that were tracked at run time, by sensor, ns. A tracked lag
-        replaces the lag from `previous` if its standard deviation is smaller.
+        replaces the lag from `previous` if the tracked lag has the smaller standard deviation.
 
     Raises
     ------

@@ -3,9 +3,10 @@
 Online learning changes only the models, not sensor-to-segment alignments, joint centers or lags. A
 candidate is fitted to the training frames of the calibration and the older part of the new frames.
 The candidate is compared with the current models on the newest frames, which are held out. The
-current models are retained, with a reason, in three cases: the candidate is not better, it is much
-worse on the earlier training frames, or its predictions differ too much from those of the current
-models. If cameras and sensors are inconsistent, the refit raises an error.
+current models are retained, with a reason, in three cases: the candidate is not better on the
+newest frames, it is much worse on the earlier training frames, or its predictions differ too much
+from those of the current models. If cameras and sensors are inconsistent, the refit raises an
+error.
 """
 
 from __future__ import annotations
@@ -214,9 +215,10 @@ def _without_heading_drift(
         shift = float(np.linalg.norm(np.median(off, axis=0)))
         if apart > CONTRADICTED or shift > SHIFTED:
             raise CalibrationError(
-                f"{name}: cameras and sensors disagree by {np.rad2deg(apart):.1f} deg "
-                f"({np.rad2deg(shift):.1f} deg constant); check marker names, or repeat the static "
-                "pose"
+                f"{name}: cameras and sensors disagree by {np.rad2deg(apart):.1f} deg in the "
+                f"median (limit {np.rad2deg(CONTRADICTED):g}), of which {np.rad2deg(shift):.1f} "
+                f"deg are constant (limit {np.rad2deg(SHIFTED):g}); check marker names, or repeat "
+                "the static pose"
             )
         reference[name] = q
     return LimbTraining(new.sensors, reference)

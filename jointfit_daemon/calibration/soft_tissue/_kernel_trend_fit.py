@@ -1,8 +1,8 @@
 """Fit of the linear trend that replaces the kernel correction outside the training range.
 
 The regressors are the disagreement of each further sensor with the first sensor and, in one of two
-fits, the tilt of the segment. The trend is the mean of both fits. If held-out movements selected
-one of the fits, the error would be larger, because two or three movements are too few for a
+fits, the tilt of the segment. The trend is the mean of both fits. The mean has a smaller error than
+the fit that is better on held-out movements, because two or three movements are too few for a
 selection.
 """
 

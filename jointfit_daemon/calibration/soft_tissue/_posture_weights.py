@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 BANDWIDTH = 0.15
 """Standard deviation b of the Gaussian kernel of the density, rad."""
 EXPONENT = -0.25
-"""Exponent of the density. Smaller exponents reduce the effect of pauses further, but increase the
-errors of simulated subjects, whose training contains all movements in equal parts."""
+"""Exponent of the density. An exponent nearer to -1 reduces the effect of pauses further, but
+increases the errors of simulated subjects, whose training contains all movements in equal parts."""
 MOST_KERNELS = 500
 """Largest number m of frames that estimate the density."""
 

@@ -29,7 +29,9 @@ Mask = NDArray[np.bool_]
 
 HUBER = 1.5
 NOISE_FACTOR = 6.0
-"""Ratio of the mean square rotation to its noise variance above which a direction is observed."""
+"""Ratio of the mean square rotation of the markers in a direction to the mean square rotation that
+noise causes. Above this ratio the direction is observed.
+"""
 _PASSES = 30
 _ROUNDED = 1e-9
 _LONGEST_STEP_M = 0.2

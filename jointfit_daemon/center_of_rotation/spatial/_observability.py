@@ -183,7 +183,7 @@ def posture_share(lasting: float, frames: float) -> float:
     """Return the fraction of the residual variance that repeats with posture.
 
     The fraction is the correlation of the residuals over `LAGS[1]` frames. It is zero if this
-    correlation is below the 99.7 % quantile of the correlation of noise.
+    correlation is less than three standard errors above `FADED`.
     """
     # A correlation ρ per frame divides the effective number of frames by (1 + ρ²)/(1 - ρ²).
     chance = FADED + 3.0 * float(np.sqrt((5.0 / 3.0) / max(frames, 1.0)))

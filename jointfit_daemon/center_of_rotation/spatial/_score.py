@@ -252,7 +252,7 @@ def _huber_weights(N: Array, rhs: Array, *, hinge: bool) -> Array:
 def _solve(
     N: Array, rhs: Array, w: Array, *, hinge: bool
 ) -> tuple[Array, Array, Array, Array, int]:
-    """Return both points (6,), gaps (n, 3), singular values, right singular vectors and rank."""
+    """Return points of both bodies (6,), gaps (n, 3), singular values, right vectors and rank."""
     root = np.sqrt(w)[:, None]
     U, s, Vt = np.linalg.svd((root[..., None] * N).reshape(-1, 6), full_matrices=False)
     rank = 5 if hinge or s[5] < HINGE_RATIO * s[4] else 6

@@ -42,7 +42,7 @@ class Repetition(NamedTuple):
 
 
 def average_repetitions(setup: StudySetup) -> Repetition:
-    """Return the median errors after averaging `setup.repeats` repetitions, in 40 simulations."""
+    """Return the median errors, over 40 simulations, of averages of `setup.repeats` repetitions."""
     rng = np.random.default_rng(setup.seed)
     found = []
     for step in STEPS_RAD:

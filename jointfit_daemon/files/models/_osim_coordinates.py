@@ -56,7 +56,7 @@ def joint_coordinates(segment: Segment, joint: OsimJoint, placed: Array) -> Join
 
 
 def unnamed_coordinates(segment: str) -> JointCoordinates:
-    """Return the coordinates of a body that no joint connects to the world, in OpenSim's axes."""
+    """Return coordinates of a body without joint or without its parent, in OpenSim's axes."""
     return euler_coordinates(segment, is_free=True, order=(_X, _Y, _Z))
 
 

@@ -70,9 +70,9 @@ def compared_pairs(group: Sequence[str]) -> list[tuple[str, str]]:
     """Return the pairs of sensors of one segment that are compared, in the order of `group`.
 
     If a segment has more than `MOST_PAIRED` sensors, the first is compared with all others. The
-    others form a ring, and each of them is also compared with its two neighbors in this ring. If a
-    single sensor slips, all pairs that contain this sensor are inconsistent, and no other pairs.
-    This is true even if another sensor is lost.
+    others form a ring, and each of them is also compared with its two neighbors in this ring. Every
+    sensor is then in at least three pairs. A single slipped sensor is therefore the only sensor
+    whose pairs are all inconsistent, even if another sensor is lost.
     """
     pairs, last = combinations(range(len(group)), 2), len(group) - 1
     return [

@@ -60,7 +60,10 @@ def drift_report(heading: float, proximal: str, distal: str, joint: str) -> Sens
 def heading_report(
     heading: float, proximal: str, distal: str, *, inconsistent: bool
 ) -> SensorReport:
-    """Return the report of two segments whose headings diverged by `heading` rad within seconds."""
+    """Return the report of two segments whose headings diverged, or agree again.
+
+    `heading` is the difference that appeared within seconds, rad.
+    """
     data = {"heading_deg": round(degrees(heading), 1)}
     if not inconsistent:
         text = f"heading agrees with {proximal} again"

@@ -33,7 +33,9 @@ LIMIT_SIGMA = 3.0
 """Heading difference at which two segments are inconsistent, in standard deviations of
 the difference without a fault."""
 RESIDUAL_SMOOTHING_S = 0.2
-"""Time constant of the remaining heading difference that is added to the uncertainty, s."""
+"""Time constant with which the heading difference after all corrections is smoothed, s. The
+smoothed difference increases the uncertainty.
+"""
 
 
 class JointHeadingMonitor:

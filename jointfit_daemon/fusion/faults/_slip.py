@@ -37,8 +37,8 @@ MIN_LIMIT = radians(6.0)
 RELEASE_SHARE = 0.65
 """Fraction of the limit below which an inconsistency may end."""
 TILT_SHARE = 0.75
-"""Fraction of the limit, for the part of a difference that is not a rotation about the vertical. Up
-to this fraction the part may be soft-tissue artefact.
+"""Fraction of the limit above which the part of a difference that is not a rotation about the
+vertical counts as a tilt. A smaller part may be soft-tissue artefact.
 """
 USUAL_FACTOR = 1.5
 """Largest usual difference of a single frame, in units of its RMS length."""
@@ -206,7 +206,7 @@ class SlipDetector:
 
         self._smooth_differences(t_ns, uncorrected, residual, tilt, usual=usual)
 
-        # The excess is the largest of three values: of this frame, of the mean, and of the change.
+        # The largest of three excesses counts: of this difference, of the mean, and of the change.
         length = hypot(*residual)
         beyond = max(0.0, length - USUAL_FACTOR * usual)
         self.exceeded = beyond > 0.0

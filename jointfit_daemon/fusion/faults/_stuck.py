@@ -1,13 +1,15 @@
 """Detection of stuck sensors, which continue to send but no longer follow their segment.
 
-A sensor is stuck if either
+A sensor is stuck in each of three cases:
 
-* it repeats its orientation while another sensor turns, or
-* it hardly rotates while its partner, another sensor on the same segment, rotates far.
+* It repeats its orientation while another sensor turns.
+* It repeats its orientation for longer while the limb is at rest and another sensor shows noise.
+* It hardly rotates while its partner, another sensor on the same segment, rotates far.
 
 A working sensor may also repeat its value, because of coarse resolution or a slow filter. The
-*natural repetition time* of a sensor is the longest repetition that ended without a fault. A stuck
-sensor is used again after 0.2 s of movement.
+*natural repetition time* of a sensor is the longest repetition that ended without a fault. A sensor
+that repeated its orientation is used again after 0.2 s of movement, and a sensor that hardly
+rotated after one window in which it follows its partner.
 
 Sensors without noise do not start or stop moving in the same frame, because their sampling instants
 differ, and because a delayed sample is extrapolated from rest. Only the part of a repetition in

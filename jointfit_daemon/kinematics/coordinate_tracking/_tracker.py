@@ -223,7 +223,7 @@ class _Shift(NamedTuple):
     rows: NDArray[np.intp]
     """Indices of the translations among the coordinates."""
     column: int
-    """First column of the segment."""
+    """First column of the segment in a step of the state."""
     inverse: Array
     start: Array
     center: Array | None
@@ -235,7 +235,8 @@ class _Shift(NamedTuple):
     ) -> _Shift | None:
         """Return the translations of a free joint; None if the joint is not free.
 
-        `first` is the index of the first coordinate of the joint, `column` its first column.
+        `first` is the index of the first coordinate of the joint, `column` the first column of its
+        segment in a step.
         """
         if form.shift_inverse is None or form.start is None or form.center is None:
             return None

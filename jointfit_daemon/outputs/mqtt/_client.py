@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import MqttSettings
 
 _UNREAD_CAPACITY = 2000
-"""Number of messages that are stored for a slow reader, equal to about ten seconds of poses."""
+"""Number of messages that are stored for a slow reader, equal to 20 s of poses at 100 Hz."""
 _LONGEST_BYTES = 1024 * 1024
 """Largest incoming packet, bytes. The quality report of a calibration takes a tenth of this
 size."""

@@ -145,7 +145,7 @@ class PacketLimitSocket:
         Raises
         ------
         BlockingIOError
-            More than `_DISCARDED_BYTES` of the packet remain to be read.
+            Bytes of the packet remain to be read in a later iteration of the event loop.
         """
         data = self._wrapped.recv(min(self._excess_bytes, _DISCARDED_BYTES))
         self._excess_bytes -= len(data)

@@ -239,7 +239,7 @@ def _read_chunk(start: int, end: int, content: bytes) -> Block:
         # If the declared sizes of the zstd data and of the chunk differ, the data could expand to
         # any size.
         if zstandard.get_frame_parameters(data).content_size != chunk.uncompressed_size:
-            raise _DamageError("the compressed size of a chunk contradicts its content")
+            raise _DamageError("a chunk and its compressed data declare different sizes")
         # A new decompressor is used, because a shared decompressor is not thread-safe.
         data = zstandard.ZstdDecompressor(max_window_size=MOST_RECORD_BYTES).decompress(data)
     elif chunk.compression:

@@ -40,8 +40,8 @@ interval and of the duration of two writes can be lost."""
 _SHORTEST_PAUSE_S = 0.02
 """Shortest pause between two writes, s; it applies to slow disks."""
 PENDING_BYTES = 16 * 1024 * 1024
-"""Largest memory for messages that wait for a slow disk, bytes. The messages of four IMUs fill it
-in ten seconds."""
+"""Largest memory for messages that wait for a slow disk, bytes. The messages of four IMUs at
+100 Hz fill it in about 20 s."""
 _MESSAGE_BYTES: dict[type, int] = {LimbState: 6000}
 """Memory that a message occupies, by its type, bytes."""
 _OTHER_BYTES = 500

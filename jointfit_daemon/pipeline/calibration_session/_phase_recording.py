@@ -47,11 +47,12 @@ class PhaseRecording:
     start_ns : int
         Host time of the start.
     wanted_s : float
-        Required duration of the phase, s; for ``functional``, the longest duration. guide :
-    MovementGuide, optional
+        Required duration of the phase, s; for ``functional``, the longest duration.
+    guide : MovementGuide, optional
         Object that tracks which movements of a functional phase are complete, and instructs the
-    subject. min_s : float
-        Shortest length of a functional phase, s.
+        subject.
+    min_s : float
+        Shortest duration of a functional phase, s.
     """
 
     def __init__(

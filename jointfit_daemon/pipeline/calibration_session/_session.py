@@ -184,8 +184,8 @@ class CalibrationSession:
     def advance(self, now_ns: int, exchanged_labels: Sequence[str] = ()) -> list[Output]:
         """Publish progress at most five times a second; end the phase when it is complete.
 
-        A complete static phase is rejected while labels of markers are exchanged. Each of
-        `exchanged_labels` is a sentence that names them.
+        A complete static phase is rejected while labels of markers are exchanged, unless the
+        request has ``force``. Each of `exchanged_labels` is a sentence that names them.
         """
         recording = self._recording
         if recording is None or not recording.progress_due(now_ns):
@@ -319,7 +319,7 @@ class CalibrationSession:
         """Return the reason why a phase cannot start; None if it can."""
         settings = self._settings
         if wanted not in COLLECTING:
-            return f"expected one of {', '.join(COLLECTING)}, abort; got {wanted!r}"
+            return f"expected one of {', '.join(COLLECTING)}, abort, revert; got {wanted!r}"
         if self._state not in RESTING:
             return self._running_text
 

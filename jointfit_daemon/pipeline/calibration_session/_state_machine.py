@@ -20,7 +20,7 @@ RESTING = (
     CalibrationPhase.CALIBRATED,
     CalibrationPhase.ABORTED,
 )
-"""Phases in which a request is accepted, because neither a recording nor a fit is running."""
+"""Phases in which a new phase may start, because neither a recording nor a fit is running."""
 
 
 class SessionEvent(StrEnum):

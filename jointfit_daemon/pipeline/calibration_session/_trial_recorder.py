@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import MocapFrame, Quaternion
 
 MAX_PHASE_S = 600
-"""Longest phase, s. One sensor at 400 Hz then has 240 000 samples, which take about 40 MB."""
+"""Longest phase, s. One sensor at 400 Hz then has 240 000 samples, which take about 65 MB."""
 
 _MAX_SAMPLES = MAX_PHASE_S * 400
 

@@ -44,10 +44,11 @@ _FEW_EVALUATIONS = 8
 """Largest number of evaluations of the marker errors in a frame, after which there is still time to
 search for exchanged labels in the same frame."""
 OPTIONS = LiveOptions(steps=6, huber_m=0.02, restart_interval=5)
-"""Options of the solver. The solver takes up to six steps per frame, because frames are 100 ms
-apart. The Huber threshold limits the influence of an exchanged marker until it is excluded. A
-restart computes the pose from the markers alone, without the previous pose, and takes longer than
-the fit of a frame. The solver therefore restarts less often after unsuccessful restarts."""
+"""Options of the solver. The solver takes up to six steps per frame, because fitted frames are
+100 ms apart by default. The Huber threshold limits the influence of an exchanged marker until it is
+excluded. A restart computes the pose from the markers alone, without the previous pose, and takes
+longer than the fit of a frame. The solver therefore restarts less often after unsuccessful
+restarts."""
 
 
 _Coordinates = tuple[tuple[ModelCoordinate, ...], tuple[tuple[float, ...], ...] | None]
@@ -142,7 +143,7 @@ class ChainTracker:
             return [state, *_notices(t_ns, reports)]
 
         pose = self._solver.feed(np.where(used[:, None], measured, np.nan))
-        # Labels are not searched in the same frame as a restart, because both take equally long.
+        # A restart takes as long as a step of the label search. Together they would take too long.
         if pose.evaluations <= _FEW_EVALUATIONS:
             self._monitor.search_labels(t_ns)
         distances, faults = self._monitor.compare(t_ns, measured, pose.rotations, pose.origins)

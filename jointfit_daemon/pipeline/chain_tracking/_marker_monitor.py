@@ -33,7 +33,8 @@ FAR_M = 0.06
 """Distance from the model position above which a marker is misplaced, m. Soft-tissue artefact is
 smaller, and so is the largest accepted marker error, 0.04 m."""
 NEAR_M = 0.03
-"""Distance from the model position below which a faulty marker can recover, m."""
+"""Distance from the model position below which a faulty marker can recover, m. In a model that
+fits, the median distance of the visible markers is also smaller."""
 FAULT_NS = 1_000_000_000
 """Time for which a marker must be misplaced, exchanged or hidden before it is flagged, ns."""
 RECOVERY_NS = 2_000_000_000

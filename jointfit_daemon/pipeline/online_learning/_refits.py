@@ -69,7 +69,7 @@ class OnlineRefits:
         """Return the state of online learning."""
         found = collector.health(now_ns)
         if self.paused and found.state != LearningState.OFF:
-            reason = "reverted; paused until the next functional calibration"
+            reason = "paused by a request until the next functional calibration"
             return LearningHealth(LearningState.OFF, reason, kept=found.kept)
         return found
 

@@ -92,10 +92,10 @@ class PlaneEstimator:
                 f"expected {1e3 * LEAST_MOVEMENT_M:.0f} mm or more: move the joints further"
             )
             return MovementPlane(None, out, reason)
-        if out > min(MOST_OFF_M, MOST_RATIO * least):
+        if out > (limit := min(MOST_OFF_M, MOST_RATIO * least)):
             reason = (
-                f"the movement is not planar: {1e3 * out:.0f} mm RMS out of the plane, "
-                f"{1e3 * least:.0f} mm in its smaller direction: move in one plane"
+                f"the movement is not planar: {1e3 * out:.0f} mm RMS out of the plane, expected "
+                f"at most {1e3 * limit:.0f} mm: move in one plane"
             )
             return MovementPlane(None, out, reason)
         normal = vectors[:, 0]

@@ -218,7 +218,7 @@ class PlanarTracker:
     def _poses(
         self, t_ns: int, measured: Mapping[str, Array]
     ) -> dict[str, PlanarPose | MissingPose]:
-        """Return the pose of every part with two markers, or the reason why it has no pose."""
+        """Return the pose of every part with two or more markers, or why it has no pose."""
         flat = {name: self._in_plane(points) for name, points in measured.items()}
         poses = {
             name: part.pose(t_ns, flat[name], partial(self._adjacent, name, flat))

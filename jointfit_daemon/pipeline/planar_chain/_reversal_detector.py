@@ -1,6 +1,6 @@
 """Detection of a segment that is rotated by 180°, because the labels of its markers are exchanged.
 
-Without a gap, exchanged labels rotate the segment from one frame to the next. After a gap, the
+Without a gap, exchanged labels rotate the segment by 180° between two frames. After a gap, the
 rotation alone does not show an exchange. The measured and the reversed pose are then compared by
 the joint centers: each marker of an adjacent body part has a known distance from the center.
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 GAP_NS = 200_000_000
-"""Time between two poses from which labels may have been exchanged without a visible rotation,
+"""Shortest time between two poses in which labels may be exchanged without a visible rotation,
 ns."""
 KEPT_NS = 60_000_000_000
 """Time after which exchanged or undecided labels are accepted, ns. After such a long time, the

@@ -128,7 +128,7 @@ class LagMonitor:
         Monitor whose estimates are continued, because a new calibration does not change the clocks.
     known : mapping, optional
         Lags from rig.toml. They are used instead of the estimated lags. The estimated lags then
-        only serve to check them.
+        only serve to check the lags from rig.toml.
     """
 
     def __init__(

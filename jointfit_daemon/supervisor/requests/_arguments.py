@@ -138,7 +138,9 @@ class RequestKind(NamedTuple):
 
 
 REQUESTS: dict[str, RequestKind] = {
-    "calibrate": RequestKind(CalibrateArguments, "Begin or abort a calibration phase."),
+    "calibrate": RequestKind(
+        CalibrateArguments, "Begin or abort a calibration phase, or revert online learning."
+    ),
     "static": RequestKind(
         StaticArguments, "Record a new static pose, which corrects the headings of the sensors."
     ),

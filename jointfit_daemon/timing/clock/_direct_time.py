@@ -1,4 +1,4 @@
-"""Host time that is not estimated from arrivals (*direct time*).
+"""Host time that is not estimated from the arrivals of the samples (*direct time*).
 
 Direct time comes from sync edges with two timestamps, or from a device clock that is declared to be
 the host clock. It takes precedence over estimates from arrivals. If a settled estimate contradicts
@@ -162,7 +162,7 @@ class SyncEdgeFit:
 
 
 DirectTime = DeclaredOffset | SyncEdgeFit
-"""A conversion from device to host time that does not use arrivals."""
+"""A conversion from device to host time that does not use the arrivals of the samples."""
 
 
 def declared_offset(clock: TickClock, unix_offset_ns: int | None) -> DeclaredOffset | None:

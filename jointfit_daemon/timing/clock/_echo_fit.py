@@ -9,7 +9,7 @@ first seconds. The error of theta_0 is half the difference between the delays of
 ``bound_ns`` is the limit of this error.
 
 Invariant: a single wrong or forged echo does not change a settled fit. An echo that contradicts the
-fit is not used. If the next echo agrees with this echo, the server clock was restarted.
+fit is not used. If the next echo agrees with it, the server clock counts as restarted.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
 For points ``y = c + s u + D`` with delays D >= 0, a line (c, s) is *feasible* if no point lies
 below it. Just above the line of the minimum delay, the number G of points per nanosecond of height
-is constant, for every shape of the delay distribution. The likelihood of a feasible line is then
-``exp(G (c + s mean(u)))``. The maximum of the likelihood is the edge of the lower convex hull that
-straddles the mean of u (Moon, Skelly, Towsley, INFOCOM 1999; Zhang, Liu, Xia, INFOCOM 2002).
+is nearly constant, for every shape of the delay distribution. The likelihood of a feasible line is
+then ``exp(G (c + s mean(u)))``. The maximum of the likelihood is the edge of the lower convex hull
+that straddles the mean of u (Moon, Skelly, Towsley, INFOCOM 1999; Zhang, Liu, Xia, INFOCOM 2002).
 
 The posterior mean under a normal prior on s has a smaller error than the maximum, and it has a
 covariance. For a given s, the largest feasible c is ``h(s) = min(y - s u)``. Below this value c is

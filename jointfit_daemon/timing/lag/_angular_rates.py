@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 KERNEL_HALF_S = 0.08
 """Half length of the low-pass kernel, s. Each gapless run loses this time at both ends."""
 GAP = 1.5
-"""Interval in nominal periods above which samples are missing."""
+"""Interval, in median sample periods, above which samples are missing."""
 BRIDGE_S = 0.035
 """Longest gap that is filled with the mean rate over the gap, s. The integral is then exact, the
 filling is symmetric, and the gap is shorter than the cut-off period. Longer gaps split the track.

@@ -243,9 +243,10 @@ def coarse_lags(
     """Return candidate lags, s, best first, and the reason if there are none.
 
     Candidates are maxima of the correlation of both rate magnitudes. The magnitudes do not depend
-    on the rotation between the systems. The best maximum must lie inside the search range. A
-    maximum at the border means that the lag is outside the range. Maxima that differ from the best
-    by at most ``_TIE`` are ranked by the size of the lag, including maxima at the border.
+    on the rotation between the systems. At least one maximum that differs from the best by at most
+    ``_TIE`` must lie inside the search range. A maximum at the border means that the lag is outside
+    the range. The maxima within ``_TIE`` of the best are ranked by the size of the lag, including
+    maxima at the border.
     """
     step, reach = settings.step_s, round(settings.span_s / settings.step_s)
     scores = _correlations(imu, ref, step, reach)

@@ -1,4 +1,4 @@
-r"""Standard deviation of a fitted lag, without assumptions about the residuals.
+r"""Standard deviation of a fitted lag, without a model for the correlation of the residuals.
 
 Residuals of low-pass filtered rates are correlated over the filter length. Errors of soft tissue,
 lens or gyro scale correlate the residuals over whole movements. The variance is therefore estimated

@@ -1,6 +1,7 @@
 """Execution of tasks in a pool of processes, or on an existing Dask cluster.
 
 Invariant: every task yields exactly one result. If a task ends its process, only this task fails.
+With one job there is no pool: a task that ends its process also ends the command.
 """
 
 from __future__ import annotations

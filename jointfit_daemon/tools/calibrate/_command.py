@@ -269,8 +269,8 @@ async def _await_answer(
     Raises
     ------
     NoAnswerError
-        No answer arrived, and no status shows that the requested phase has begun. In the case of a
-        phase, an abort request was sent, because the daemon may still receive the first request.
+        No answer arrived, and no status shows that the requested phase has begun. If `name` is a
+        phase, an abort request was sent, because the daemon may still receive `request`.
     """
     from jointfit_daemon.outputs.mqtt import BrokerLostError, NoAnswerError
 

@@ -33,7 +33,7 @@ CHI2_95 = {1: 3.841, 2: 5.991, 3: 7.815}
 """95 % quantile of the chi-squared distribution, by degrees of freedom. The squared semi-axis of a
 95 % ellipsoid is this quantile times the variance along the semi-axis."""
 STILL_M = 0.005
-"""RMS movement of the child markers, m, below which the centre is unobservable."""
+"""RMS movement of the child marker that moves most, m, below which the centre is unobservable."""
 _SEGMENT_M = (0.005, 2.0)
 """Plausible extent of the markers of one segment, m; other values indicate a wrong unit."""
 LEAST_PLANAR = 2
@@ -313,7 +313,7 @@ def answers(
 
 
 def _refuse_small_motion(found: CenterEstimate, points: Array) -> CenterEstimate:
-    """Refuse an estimate if the child markers move by less than `STILL_M`.
+    """Refuse an estimate if each child marker moves by less than `STILL_M` RMS.
 
     Rotational noise of the parent could explain such a small motion.
     """

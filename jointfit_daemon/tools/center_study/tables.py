@@ -37,8 +37,8 @@ CAVEATS = (
     " The results approach the published table only with clipped errors and a small search region"
     " of the grid.",
     "Clipping limit and search region were chosen so that the results approach the published table"
-    " (marked *). The publication states neither these values nor the step of the grid. Some of its"
-    " digits are illegible.",
+    " (marked *). The publication states neither these values nor the step of the grid. Some digits"
+    " of the published table are illegible.",
     "At small α the grid has smaller errors than the analytic solution, because its search region"
     " is centered on the true center and limits the error: at α = 5° the error equals half the"
     " width of the region. With three points both methods have the same optimum.",
@@ -91,8 +91,8 @@ def tables(setup: StudySetup, study: Sequence[PairMaps], more: StudyExtension) -
         f" at r = {setup.radius:g} m and σ = {MM_PER_M * setup.noise:g} mm",
         _indent_table(repetition),
         "Effect of the radius: 95th percentile of the error, divided by the"
-        f" percentile at r = {100 * setup.radii[-1]:g} cm, α = {np.rad2deg(setup.step):.0f}°,"
-        f" σ = {MM_PER_M * LARGE_NOISE_M:g} mm",
+        f" percentile at r = {100 * setup.radii[-1]:g} cm; all at α ="
+        f" {np.rad2deg(setup.step):.0f}° and σ = {MM_PER_M * LARGE_NOISE_M:g} mm",
         _indent_table(
             [
                 ("r, cm", *(f"{100 * r:g}" for r in RADII_M)),

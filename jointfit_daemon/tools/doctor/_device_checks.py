@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 CHECK = "sensor"
 _LISTEN_S = 1.0
-"""Time at each speed, s. It suffices for three samples at 5 Hz."""
+"""Listening time at each line speed, s. It suffices for `LEAST_SAMPLES` samples at 5 Hz."""
 _CONNECTION = {"id", "segment", "driver", "port", "baud", "transport", "silence_s"}
 """Keys of ``[[imu]]`` that do not affect decoding."""
 _SILENT = (
@@ -92,7 +92,8 @@ def _compare(  # noqa: PLR0911 - one for each finding
         )
         return Finding(CHECK, name, "error", f"{text}, expected {expected}", remedy)
 
-    # The driver also decodes the data with its default settings, but only rig.toml matters here.
+    # The configured driver may have decoded the data twice: with the settings of rig.toml, and with
+    # its default settings. Prefer the settings of rig.toml.
     same = [device for device in heard.devices if device.driver == source.driver]
     own = [device for device in same if table.items() <= device.settings.items()] or same
     others = [device for device in heard.devices if device.driver != source.driver]

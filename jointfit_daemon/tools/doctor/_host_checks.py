@@ -25,7 +25,11 @@ _SERVICE_STATE = "/var/lib/jointfitd"
 
 
 def check_clock(host: Host, *, needed: bool) -> Iterator[Finding]:
-    """Yield the finding on clock synchronization; `needed` if cameras send PTP time stamps."""
+    """Yield the finding on clock synchronization.
+
+    Without synchronization, the finding is a warning. It is an error if `needed` is set, because
+    cameras send PTP time stamps.
+    """
     synchronized = host.clock_is_synchronized()
     if synchronized is None:
         text = "the state of the clock cannot be read here"
@@ -35,7 +39,7 @@ def check_clock(host: Host, *, needed: bool) -> Iterator[Finding]:
     else:
         text = "the system clock is not synchronized: UNIX times of messages may be wrong"
         if needed:
-            text += ", and so are the stamps of cameras on PTP"
+            text += ", and so may the time stamps of cameras on PTP"
         remedy = "sudo timedatectl set-ntp true (or install chrony; for PTP: linuxptp)"
         yield Finding("clock", "", "error" if needed else "warning", text, remedy)
 

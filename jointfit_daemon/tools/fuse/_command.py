@@ -102,7 +102,7 @@ def evaluate(
     holdout: Annotated[
         float,
         typer.Option(
-            "--holdout", min=0.1, max=0.9, help="Held-out share if there is only one trial."
+            "--holdout", min=0.1, max=0.9, help="Held-out share at the end of a single trial."
         ),
     ] = 0.4,
     json: Json = False,
@@ -110,7 +110,10 @@ def evaluate(
         Path | None, typer.Option("--plot", help="Plot all methods: .png, .svg or .pdf.")
     ] = None,
 ) -> None:
-    """Evaluate all methods by leave-one-trial-out cross-validation."""
+    """Evaluate all methods by leave-one-trial-out cross-validation.
+
+    If there is only one trial, the methods are fitted to its beginning and evaluated on its end.
+    """
     from jointfit_daemon.calibration.phases import evaluate
 
     check_plot(plot)

@@ -120,8 +120,9 @@ def _measured_lengths(
 
     Only NPZ files contain origins of bones (``p_BONE``). The origin of a bone is its proximal joint
     center. The length of a segment is the median distance from its origin to the origin of the next
-    segment, over all files. The standard deviation of the length is robust (median absolute
-    deviation). The last segment has no next segment, so its length remains unknown.
+    segment, over all files. With fewer than `FEWEST` distances, the length remains unknown. The
+    standard deviation of the length is robust (median absolute deviation). The last segment has no
+    next segment, so its length remains unknown.
     """
     arrays = [path for path in references if path.suffix.lower() == ".npz"]
     recordings = [read_recording(path, limb.up) for path in arrays]

@@ -211,7 +211,8 @@ def write_fused(
     ``.npz``: a file for `read_orientations_npz`, with joint quantities by name, rad and m.
     ``.csv``: all columns in one table.
 
-    An STO or MOT file contains the part of its table that is known, see `files.orientations`.
+    An STO or MOT file contains the part of its table that is known, see `files.orientations`, and
+    has the vertical axis `up`. NPZ and CSV files are z up.
     """
     kind = path.suffix.lower()
     if kind in {".npz", ".csv"}:

@@ -66,7 +66,7 @@ def read_recording(path: Path, up: Axis) -> OrientationRecording:
     kind = path.suffix.lower()
     if kind == ".npz":
         trial = read_orientations_npz(path)
-        for name, array in read_arrays(path).items():  # quaternions in `trial` are normalized
+        for name, array in read_arrays(path).items():  # not in `trial`, which is normalized
             if name.endswith("_quat") or name.startswith("q_"):
                 check_unit_norm(path, name, np.asarray(array, dtype=np.float64))
         table = OrientationRecording(trial.t_s, trial.sensors, trial.bones, trial.origins)

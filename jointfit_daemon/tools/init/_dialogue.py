@@ -65,7 +65,8 @@ class Dialogue:
         Raises
         ------
         UnansweredError
-            Only in a script, if an answer is missing or not accepted.
+            A prepared answer is not accepted. In a script also: an answer is missing, or a prepared
+            answer belongs to no question.
         """
         while (asked := self.next()) is not None:
             if asked.key in self.prepared:

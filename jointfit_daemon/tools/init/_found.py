@@ -53,7 +53,7 @@ class CanSensor:
         return f"{self.driver} {' '.join(map(hex, self.ids))}{settings}"
 
     def agrees(self, driver: str, settings: Mapping[str, str]) -> bool:
-        """Return whether the driver is `driver` and no setting, as text, contradicts `settings`."""
+        """Return whether the driver is `driver` and no setting differs from that in `settings`."""
         pairs = ((str(value), settings.get(key)) for key, value in self.settings.items())
         return driver == self.driver and all(given in {own, None} for own, given in pairs)
 

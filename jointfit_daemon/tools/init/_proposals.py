@@ -96,9 +96,9 @@ def baud(answers: Given, found: Found, sensor: str) -> int:
 
 
 def setting(answers: Given, found: Found, subject: str) -> str | None:
-    """Return the value in the data of the device, or else that of the last sensor of its driver.
+    """Return the value that the first matching free sensor on the bus has.
 
-    If neither value is known, return None.
+    If there is none, return the answer for the last sensor with the same driver, or else None.
     """
     sensor, _, key = subject.rpartition(".")
     name, given = driver_of(answers, found, sensor).name, chosen_settings(answers, sensor)
@@ -162,9 +162,9 @@ def markers(answers: Given, found: Found, part: str) -> tuple[str, ...] | None:
     """Return the streamed marker names that match `part`; without a stream, return usual names.
 
     Marker names that differ only in their last digits form a group. A group matches a body part if
-    its name equals the name of the part or one of the usual prefixes of the part, and if it has
-    enough markers. If no group matches, the result is empty for an optional part, and None for a
-    required part.
+    the common text equals the name of the part or one of the usual prefixes of the part, and if the
+    group has at least three markers (planar limb: one). If no group matches, the
+    result is empty for an optional part, and None for a required part.
     """
     if not found.markers:
         return unused_markers(answers, found, part)

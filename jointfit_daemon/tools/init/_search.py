@@ -200,7 +200,7 @@ class DeviceSearch:
         return found
 
     def recognized_driver(self, found: Found, port: str) -> tuple[Found, str]:
-        """Return the driver that decodes the data of a serial port, and a description.
+        """Return `found` with the driver that decodes the data of a port, and a text for the user.
 
         The search sends nothing to the device.
 

@@ -271,7 +271,7 @@ def _cycle_figure(results: SessionResults, joint: JointSeries, angle: str, gait:
 
     spread = float(np.nanmean(sd))
     caption = (
-        f"{name}: {_range_text(mean)} on average, {decimal(spread)}° between cycles,"
+        f"{name}: mean curve {_range_text(mean)}, sd between cycles {decimal(spread)}°,"
         f" {count_text(len(curves.cycles), 'cycle')}"
     )
     return figure(image(_PANEL, 200.0, caption, parts), caption)

@@ -155,7 +155,7 @@ def _camera_tile(results: SessionResults) -> tuple[str, str, str, bool]:
         return "Against the cameras", UNKNOWN, "the cameras measured no reference", False
     found = results.differences[0]
     name = joint_angle(found.joint, found.angle)
-    return "Against the cameras", degree(found.rms), f"RMS of {name.lower()}", False
+    return "Against the cameras", degree(found.rms), f"RMS difference, {name.lower()}", False
 
 
 def _loss_tile(results: SessionResults) -> tuple[str, str, str, bool]:

@@ -167,7 +167,7 @@ class ShtpCodec:
             available = int.from_bytes(data[1:], "little")
             return ShtpBufferStatus(available, len(segment) + 2, end)
         if data[0] != _SHTP or len(data) < _HEAD:
-            return self._corrupt(len(segment), "protocol")
+            return self._corrupt(len(segment), "neither a packet nor a buffer status")
         length, channel, sequence = _HEADER.unpack_from(data, 1)
         if length & _LENGTH != len(data) - 1:
             return self._corrupt(len(segment), "length")

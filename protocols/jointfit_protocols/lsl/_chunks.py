@@ -177,7 +177,7 @@ def _content(data: bytes, at: int) -> tuple[int, int, int] | str:
         return "no XDF chunk"
     length = _LENGTHS[size].unpack_from(data, at + 1)[0]
     if not _START.size <= length <= len(data) - start:
-        return f"chunk of {length} bytes in {len(data) - start}"
+        return f"chunk states {length} bytes, expected {_START.size} to {len(data) - start}"
     tag, stream = _START.unpack_from(data, start)
     if stream != _STREAM:
         return f"chunk of stream {stream}"

@@ -165,7 +165,7 @@ def read_frame(cursor: Cursor, sized: bool) -> FrameOfData:
     timecode, subframe, timestamp, exposure, received, transmit = cursor.unpack(STAMPS_LAYOUT)
     precision = cursor.unpack(PRECISION_LAYOUT) if cursor.left == _LONG_TAIL else None
     if cursor.left != _SHORT_TAIL:
-        raise MalformedError(f"{cursor.left - _SHORT_TAIL:+d} bytes where the end should be")
+        raise MalformedError(f"{cursor.left} bytes left for the end, expected {_SHORT_TAIL}")
 
     params, end = cursor.unpack(END_LAYOUT)
     if end:

@@ -166,7 +166,7 @@ def decode(datagram: bytes, version: Version) -> Message | CorruptBytes:
     found = read(datagram[HEADER.size :])
     if found is None:
         return CorruptBytes(
-            len(datagram), f"{NatNetMessageId(number).name} of {len(datagram)} bytes"
+            len(datagram), f"{NatNetMessageId(number).name}: no form has {len(datagram)} bytes"
         )
     return found
 

@@ -151,7 +151,7 @@ def decode(packet: bytes) -> Message | CorruptBytes:
         return CorruptBytes(len(packet), "shorter than a packet header")
     size, kind = HEADER.unpack_from(packet)
     if size != len(packet):
-        return CorruptBytes(len(packet), f"packet of {len(packet)} bytes announces {size}")
+        return CorruptBytes(len(packet), f"packet of {len(packet)} bytes states {size} bytes")
 
     if kind == PacketType.DATA:
         return _decode_frame(packet)

@@ -9,7 +9,7 @@
 
 `xor_out` is combined with the result by XOR. The parameters of a CRC have the meanings of the
 catalogue of parametrised CRC algorithms. If the checksum is the two's complement of the sum, init
-and xor_out are 0xFF.
+and xor_out are 0xFF for sum8, and 0xFFFF for sum16.
 
 Invariant: the checksums are pure functions of bytes. Parameters are compiled only once.
 """

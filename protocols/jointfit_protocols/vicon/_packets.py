@@ -28,7 +28,7 @@ def decode(packet: bytes) -> Packet | CorruptBytes:
     if kind != PACKET:
         return CorruptBytes(size, f"block {kind:#x} is no packet")
     if length != size - HEADER.size:
-        return CorruptBytes(size, f"packet of {size} bytes announces {length + HEADER.size}")
+        return CorruptBytes(size, f"packet of {size} bytes states {length + HEADER.size} bytes")
 
     objects = _decode_objects(packet)
     return CorruptBytes(size, objects) if isinstance(objects, str) else Packet(objects)
@@ -44,7 +44,7 @@ def _decode_objects(packet: bytes) -> tuple[Object, ...] | str:
         kind, length = HEADER.unpack_from(packet, at)
         at += HEADER.size
         if length > size - at:
-            return f"object {kind} of {length} bytes in {size - at}"
+            return f"object {kind} states {length} bytes, but {size - at} follow"
         item = decode_object(kind, view[at : at + length])
         if isinstance(item, str):
             return item

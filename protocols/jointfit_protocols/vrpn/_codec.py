@@ -214,10 +214,10 @@ class VrpnCodec:
         time_us = seconds * _US + micros
         match self._kinds.get(kind):
             case _Kind.POSE:
-                return "pose without 64 bytes"
+                return "pose whose body does not have 64 bytes"
             case _Kind.VELOCITY | _Kind.ACCELERATION:
                 if len(body) != MOTION_LAYOUT.size:
-                    return "velocity or acceleration without 72 bytes"
+                    return "velocity or acceleration whose body does not have 72 bytes"
                 return TrackerMotion(self.types[kind], time_us, sender, *MOTION_LAYOUT.unpack(body))
             case _Kind.PING:
                 return Ping(time_us, sender)

@@ -30,7 +30,7 @@ _NEAR = 0.5
 _SPAN_NS = 1_000_000_000
 """Shortest span of arrivals over which the rate is measured, ns."""
 _CONTRADICTIONS = 2
-"""Number of consecutive spans of arrivals that correct the unit."""
+"""Number of consecutive spans of arrivals that determine or correct the unit."""
 _NS = 1_000_000_000
 
 

@@ -102,8 +102,9 @@ def read_recorded_trial(paths: Sequence[Path]) -> RecordedTrial:
 class InterpolatedTrack:
     """Vectors or quaternions over time, interpolated between their samples.
 
-    The interpolation is linear. For unit quaternions, after sign alignment, the result is within
-    1e-5 rad of the shortest arc if successive samples differ by less than 5 degrees.
+    The interpolation is linear. Unit quaternions are sign-aligned before it, and normalized after
+    it. The result then differs by less than 1e-5 rad from a rotation at constant rate if successive
+    samples differ by less than 5 degrees.
 
     Parameters
     ----------

@@ -79,9 +79,9 @@ class SoftTissue:
     Each adjacent joint *j* has the angles :math:`\theta_j = (f, a, i)`: flexion, adduction and
     internal rotation. Its features are
     :math:`\Phi = (\sin f, 1-\cos f, \tfrac12\sin 2f, \sin a, \sin i)`. The matrix :math:`C_j` is
-    random. *n* is band-limited noise (0.3 to 3 Hz). Its factor *g* is the magnitude of the features
-    of all adjacent joints, :math:`\theta`. Both terms are scaled so that the RMS length of *d* over
-    all points and the `reference` is `rms`.
+    random. *n* is band-limited noise (0.3 to 3 Hz). Its factor :math:`g(\theta)` is the weighted
+    magnitude of the features of all adjacent joints. Both terms are scaled so that the RMS length
+    of *d* over all points and the `reference` is `rms`.
 
     Parameters
     ----------

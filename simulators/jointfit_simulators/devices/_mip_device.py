@@ -112,7 +112,7 @@ class _StreamState:
     outputs: tuple[FormatEntry, ...] = ()
     is_on: bool = False
     count: int = 0
-    """Number of samples since the start of the stream."""
+    """Number of samples since power-up or the last change of the message format."""
     delayed: list[tuple[int, Quaternion]] = field(default_factory=list)
     """Samples that are not yet sent, each with time and orientation."""
 

@@ -199,7 +199,7 @@ class TableDeviceOptions:
     invalid: int = 0
     """Number of samples after power-up that are marked as invalid."""
     greeting: bytes = b""
-    """Bytes sent at power-up, such as a text."""
+    """Bytes sent before the first sample after power-up, such as a text."""
     other: bytes = b""
     """Message of another type, sent before every tenth sample."""
     first_ns: int = 0

@@ -110,7 +110,7 @@ class VectorNavDevice(SerialDevice):
     def _power_up(self) -> None:
         none = BinaryOutput(0, 1, ())
         self.outputs = {number: self._stored_outputs.get(number, none) for number in _OUTPUTS}
-        """Active binary outputs, by register."""
+        """Current settings of the binary outputs, by register."""
         self.text_output = self._stored_text
         """Active ASCII output; empty if it is off."""
         self.paused = False

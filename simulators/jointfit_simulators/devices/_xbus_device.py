@@ -43,7 +43,7 @@ _MOST_OUTPUTS = 32
 _COUNTS = 1 << 16
 """Modulus of the packet counter."""
 _FOREIGN_EVERY = 12
-"""Every twelfth message is from a GNSS receiver: more than 4 Hz for orientations at 50 Hz."""
+"""Every twelfth message is from a GNSS receiver. With orientations at 50 Hz, this is 4.5 Hz."""
 _PARAMETER = b"\x21"
 """Error code for a parameter out of range."""
 _INVALID = b"\x04"

@@ -120,7 +120,7 @@ class RecordedCanSource:
         return self.wire.is_open
 
     def send(self, data: bytes) -> None:
-        """Send the frames of a chunk, except error frames and notes of the recording host."""
+        """Send the frames of a chunk, except error frames and the host's notes on lost frames."""
         frames = [one for one in unpack_frames(data) if isinstance(one, CanFrame) and not one.error]
         self.sent += self.wire.send(frames)
 
@@ -137,7 +137,7 @@ class RecordedCameras:
     """NatNet server that sends recorded datagrams in unicast on the loopback interface.
 
     The server answers with the recorded name, version, clock frequency and model. Its clock
-    continues the recorded clock. The server sends this time in its answers to EchoRequest messages.
+    continues the recorded clock. Answers to EchoRequest messages contain the time of this clock.
 
     Parameters
     ----------

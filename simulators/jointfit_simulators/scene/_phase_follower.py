@@ -35,7 +35,7 @@ MOTIONS_OF_PHASES: dict[str, dict[str, _Motions]] = {
     }
     for limb, motions in _FUNCTIONAL.items()
 }
-"""Sequence of motions in each phase, by limb, with their durations, s.
+"""Motions of each phase with their durations, s, by limb; a phase repeats its motions.
 
 In other phases, the subject stands."""
 _OTHER_PHASES = (("stand", 5.0),)
@@ -122,7 +122,7 @@ class PhaseFollower:
         )
 
     async def _play_in_turn(self, motions: tuple[tuple[str, float], ...]) -> None:
-        """Play all motions after the first motion, one after another."""
+        """Repeat the motions in a cycle; the first motion already plays."""
         if len(motions) == 1:
             return
         for at, (name, seconds) in enumerate(cycle(motions)):

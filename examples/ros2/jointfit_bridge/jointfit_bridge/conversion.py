@@ -57,7 +57,7 @@ def joint_angles(pose: dict[str, Any]) -> JointAngles:
     """Return the known angles of all joints, with names ``JOINT_ANGLE`` such as ``knee_flexion``.
 
     Signs are anatomical (flexion is positive) and may differ from those of a robot model. Unknown
-    angles are omitted, because a message has no value for them.
+    angles are omitted, because ``JointState`` cannot represent them.
     """
     names, positions, rates = [], [], []
     for joint, values in pose["joints"].items():

@@ -1,6 +1,6 @@
-// Read and request permissions of the page's account. A broker hides a topic without a message: it grants
-// the subscription but sends no message. The daemon publishes `bridge/state` after all other retained
-// topics, so a topic that is missing some seconds later is hidden from the account.
+// Read and request permissions of the page's account. A broker does not report that an account may not
+// read a topic: it grants the subscription, but sends no messages. The daemon publishes `bridge/state`
+// after all other retained topics, so a topic that is missing some seconds later is hidden from the account.
 
 const SETTLE_MS = 3000;
 const CHECK_WITHIN_MS = 2000; // pages that reconnect together after a restart check one after another

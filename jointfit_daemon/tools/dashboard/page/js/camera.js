@@ -21,7 +21,7 @@ export function createCamera() {
     follow(points, length, firstSegment, seconds, still) {
       const center = scale(points.reduce((sum, p) => sum.map((v, i) => v + p[i]), [0, 0, 0]), 1 / points.length);
       const lowest = Math.min(...points.map((p) => p[2])) - 0.14 * length;
-      // The position of the first joint jumps when the cameras begin or stop to locate it.
+      // The position of the first joint jumps when the cameras start or stop locating it.
       const first = camera.target === null || norm(subtract(center, camera.target)) > JUMP * length;
       if (first) camera.floor = null;
       const share = (time) => (first || still ? 1 : 1 - Math.exp(-seconds / time));
