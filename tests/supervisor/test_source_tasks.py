@@ -85,7 +85,7 @@ async def test_misconfigured_server_is_retried_sooner_than_a_port(
         assert [driver.opened for driver in drivers] == [1, 0]
         texts = {event.source: event.text for event in events if isinstance(event, SourceClosed)}
         assert "(retrying within" in texts["server"]
-        assert "with another device on the port" in texts["port"]
+        assert "when another device is on the port" in texts["port"]
         await sources.stop()
 
 

@@ -91,7 +91,7 @@ class LpmsCanDevice(CanDevice):
     def line_ns(self) -> int:
         """Transmission time of the frames of one period, ns."""
         bitrate = self.wire.bitrate
-        frames = self._channel_frames((1.0, 0.0, 0.0, 0.0))
+        frames = self._period_frames(0, (1.0, 0.0, 0.0, 0.0))
         bits = sum(frame_bits(len(frame.data), extended=False) for frame in frames)
         return bits * NS_PER_S // bitrate if bitrate else 0
 
@@ -103,10 +103,7 @@ class LpmsCanDevice(CanDevice):
         if self._to_lose:
             self._to_lose -= 1
             return
-        if self._options.mode == "lpbus":
-            frames = self._wrapped_frames(device_ns, q_world_sensor)
-        else:
-            frames = self._channel_frames(q_world_sensor)
+        frames = self._without_lost(self._period_frames(device_ns, q_world_sensor))
         if self.wire.is_open and frames and self.wire.send(frames):
             self.sent += 1
 
@@ -137,23 +134,38 @@ class LpmsCanDevice(CanDevice):
         w, x, y, z = native_of(q, self._options.world)
         return (w, -x, -y, -z) if self._options.world_to_sensor else (w, x, y, z)
 
+    def _period_frames(self, device_ns: int, q: Quaternion) -> list[CanFrame]:
+        """Return the frames of one period."""
+        if self._options.mode == "lpbus":
+            return self._wrapped_frames(device_ns, q)
+        frames = self._channel_frames(q)
+        return frames[::-1] if self.swapped else frames
+
+    def _without_lost(self, frames: list[CanFrame]) -> list[CanFrame]:
+        """Return the frames except those that are to be lost next."""
+        sent = []
+        for frame in frames:
+            index = self._ids.index(frame.can_id) if frame.can_id in self._ids else -1
+            left = self._to_lose_frames.get(index, 0)
+            if left:
+                self._to_lose_frames[index] = left - 1
+            else:
+                sent.append(frame)
+        return sent
+
     def _channel_frames(self, q: Quaternion) -> list[CanFrame]:
-        """Return the frames of one period, except the frames that are to be lost."""
+        """Return the frames of one period in channel mode, by ascending identifier."""
         options = self._options
         unit = options.unit if options.precision == "int16" else 1
         channels = [0.0] * (4 * PER_FRAME[options.precision])
         for channel, part in zip(options.mapping, self._native(q), strict=True):
             channels[channel - 1] = part * unit
 
-        frames = []
-        for index, frame in enumerate(encode_frames(self._ids, channels, options.precision)):
-            if index not in self._used and not options.sends_idle_frames:
-                continue
-            if left := self._to_lose_frames.get(index, 0):
-                self._to_lose_frames[index] = left - 1
-                continue
-            frames.append(frame)
-        return frames[::-1] if self.swapped else frames
+        return [
+            frame
+            for index, frame in enumerate(encode_frames(self._ids, channels, options.precision))
+            if index in self._used or options.sends_idle_frames
+        ]
 
     def _wrapped_frames(self, device_ns: int, q: Quaternion) -> list[CanFrame]:
         """Return an LP-BUS data packet in frames of at most 8 bytes."""

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 async def run(gateway: Gateway) -> Outcome:
     """Start the server again with bitstream 4.1."""
     since, cameras = len(gateway.listener.poses), gateway.cameras
+    before = await gateway.device("mocap")
     cameras.server.unplug()
     noticed_s = await gateway.seconds(lambda: "mocap" not in gateway.listener.online)
     cameras.set_options(bitstream=(4, 1))
@@ -27,7 +28,8 @@ async def run(gateway: Gateway) -> Outcome:
     cameras.server.restart()
     await asyncio.sleep(1.0)
     await gateway.streaming("mocap")
-    return Outcome(noticed_s, recovered_s, gateway.pose_gap_s(since), after["corrupt"])
+    corrupt = after["corrupt"] - before["corrupt"]
+    return Outcome(noticed_s, recovered_s, gateway.pose_gap_s(since), corrupt)
 
 
 SCENARIO = Scenario(
