@@ -137,12 +137,12 @@ def test_excluded_learning_gives_a_reason_and_no_notice(how: dict[str, Any], why
     assert why in reason
 
 
-def test_reverted_learning_gives_its_reason() -> None:
+def test_paused_learning_gives_its_reason() -> None:
     one = collector()
     feed(one, 5.0)
     found = OnlineRefits(paused=True).health(one, 5 * S)
     assert found.state == "off"
-    assert "reverted" in str(found.reason)
+    assert "paused by a request" in str(found.reason)
 
 
 def test_long_lists_of_markers_are_shortened() -> None:
