@@ -70,8 +70,8 @@ class ReceivedMessages:
     pose: dict[str, Any] = field(default_factory=dict)
     first_pose_s: float | None = None
     running_s: float | None = None
-    """Monotonic time of the message ``online`` on ``bridge/state``, s. `first_pose_s` is the
-    monotonic time of the first pose."""
+    """Monotonic time of the first message on ``bridge/state``, s. `first_pose_s` is the monotonic
+    time of the first pose."""
 
     async def listen(self, client: MqttClient) -> None:
         async for topic, payload in client.messages():
@@ -100,13 +100,15 @@ class Figures:
     cpu_s: float
     """CPU time of the daemon during the measurement, s."""
     loop_s: float
-    """CPU time of a fixed loop during the run, s."""
+    """CPU time of a fixed computation after the measurement, s, which shows the speed of the
+    machine."""
     waited_s: float
     """Time in which the daemon was ready to run but had no processor core, because the machine was
     loaded, s."""
     rss_mb: float
     unaccounted: int
-    """Number of samples that were sent but not received, or that have no outcome."""
+    """Number of samples that were sent but not received, or that are neither pending nor have an
+    outcome."""
     dropped: int
     """Number of samples with the outcome ``dropped``."""
     received: int
@@ -242,7 +244,7 @@ async def running_gateway(
 
 
 def daemon_variant(folder: Path, rig_file: Path, *, compiled: bool) -> ChildProcess:
-    """Return the daemon process on the sources, or on the modules in build/compiled."""
+    """Return the process of the daemon, which runs the Python files or the compiled modules."""
     process = daemon(folder, rig_file)
     if compiled:
         paths = (str(COMPILED), str(ROOT))
@@ -292,9 +294,9 @@ async def _last_health(heard: ReceivedMessages) -> dict[str, Any]:
 
 
 def unaccounted(sent: dict[str, int], devices: dict[str, dict[str, Any]]) -> int:
-    """Return the number of samples that were not received, or that have no outcome.
+    """Return the number of samples that were not received, or that are without an outcome.
 
-    Dropped samples have an outcome, so this number does not contain them.
+    Pending samples, and samples with the outcome ``dropped``, are not counted.
     """
     lost = 0
     for name, device in devices.items():

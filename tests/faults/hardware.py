@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 PERIOD_S = 0.01
 MARKERS = ("T1", "T2", "T3")
 FAR_NS = 1_000_000_000_000
-"""Time of the server's clock at the start of a recording, ns."""
+"""Time of the server's clock at its first frame, ns; far from the time of the host."""
 
 
 class CameraServer(NatNetServer):
@@ -78,7 +78,7 @@ class Cameras:
         self.answering: asyncio.Task[None] | None = None
 
     def set_options(self, **changed: object) -> None:
-        """Change constant properties of the server; its clients must connect again."""
+        """Change options of the server; its clients see the change after they connect again."""
         self.server.options = replace(self.server.options, **changed)  # type: ignore[arg-type]
         self.server.set_bodies(self.server.options.bodies)
 

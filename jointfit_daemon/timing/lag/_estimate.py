@@ -106,8 +106,8 @@ def estimate_lag(
     """Estimate the lag between two tracks of orientations.
 
     The lag of filtered orientations differs from the lag of the gyro, because the output of an
-    orientation filter leads the gyro by half the internal period of the filter. Each lag applies
-    only to the quantity from which it was estimated.
+    orientation filter leads the gyro by half the update interval inside the filter. Each lag
+    applies only to the quantity from which it was estimated.
 
     Parameters
     ----------
@@ -231,6 +231,9 @@ def _best_and_rival(fits: list[LagFit], seen: LagEstimate) -> tuple[LagFit, LagF
     # Lags are compared in whole milliseconds, because the sizes of two lags of opposite sign may
     # differ by rounding errors.
     nearest = min(alike, key=lambda fit: (round(1e3 * abs(fit.tau_s)), fit.tau_s < 0.0))
+
+    # One lag differs from the best by more than _SAME_S, so at least one differs from the nearest
+    # by more than half of it.
     others = [fit for fit in alike if abs(fit.tau_s - nearest.tau_s) > _SAME_S / 2]
     return nearest, min(
         others, key=lambda fit: (round(1e3 * abs(fit.tau_s - nearest.tau_s)), fit.tau_s < 0.0)

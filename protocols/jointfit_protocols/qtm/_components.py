@@ -56,7 +56,10 @@ _YEAR_BITS, _DAY_AT, _TENTHS_BITS = 0x7F, 7, 0xF
 
 
 class ItemsComponent(NamedTuple):
-    """Markers or bodies in the order of the settings XML. Unlabeled markers have an id."""
+    """Labeled markers or bodies in the order of the XML settings of QTM, or unlabeled markers.
+
+    Each unlabeled marker has an id.
+    """
 
     type: int
     drop_rate: int
@@ -125,7 +128,7 @@ class SkeletonSegment(NamedTuple):
 
 
 class SkeletonComponent(NamedTuple):
-    """Skeletons in the order of the settings XML.
+    """Skeletons in the order of the XML settings of QTM.
 
     A skeleton that is not visible has no segments.
     """
@@ -135,7 +138,7 @@ class SkeletonComponent(NamedTuple):
 
 
 class OpaqueComponent(NamedTuple):
-    """A component whose type is not read, such as analog or force data."""
+    """A component whose content is not decoded, such as analog or force data."""
 
     type: int
     data: bytes

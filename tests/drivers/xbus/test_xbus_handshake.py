@@ -79,7 +79,9 @@ async def test_emitted_bytes_begin_with_the_acknowledgement_and_contain_all_repl
     found = mids(chunks)
     assert found[0] == XbusMessageId.GOTO_CONFIG_ACK
     setup_ids = found[: found.index(XbusMessageId.GOTO_MEASUREMENT_ACK)]
-    assert XbusMessageId.MT_DATA2 not in setup_ids  # no earlier message
+    assert (
+        XbusMessageId.MT_DATA2 not in setup_ids
+    )  # data from before the acknowledgement are discarded
     assert {
         XbusMessageId.DEVICE_ID, XbusMessageId.PRODUCT_CODE, XbusMessageId.FIRMWARE,
         XbusMessageId.FILTER_PROFILE_ACK, XbusMessageId.OUTPUT_CONFIGURATION_ACK,
@@ -221,7 +223,7 @@ async def test_a_device_that_acknowledges_after_a_second_and_a_half_comes_up(
         device = Queueing(folder / "imu", options=XbusDeviceOptions(measures_at_once=streams))
         async with serving(device, feeding=True):
             assert len(await chunks_of(make(folder))) >= 5
-            assert device.asked == 1 or not streams, "one request at a time"
+            assert device.asked == 1 or not streams, "a streaming device gets one request"
 
     # Both cases wait for seconds, so they run concurrently.
     await asyncio.gather(

@@ -157,7 +157,7 @@ def test_an_impossible_length_discards_until_the_next_connection(length: int) ->
         (encode(SenderDescription(2000, "x")), "id outside"),
         (THIGH[:24] + b"\0\0\1\6" + THIGH[28:], "name longer"),
         (struct.pack(">IIIiiI", 24, 0, 0, 1, -1, 0), "without a name"),
-        (DESCRIBED + struct.pack(">IIIiiI8x", 32, 0, 0, 1, 0, 0), "pose whose body does not have 64 bytes"),
+        (DESCRIBED + struct.pack(">IIIiiI8x", 32, 0, 0, 1, 0, 0), "does not have 64 bytes"),
         (DESCRIBED + struct.pack(">IIIiiI8x", 32, 0, 0, 1, 1, 0), "72 bytes"),
         (DESCRIBED + struct.pack(">IIIiiI", 24, 0, 1_000_000, 1, 3, 0), "microseconds"),
     ],
