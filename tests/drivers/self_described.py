@@ -1,4 +1,4 @@
-"""Tables of self-described devices, and virtual devices that send what the tables describe."""
+"""Tables of rig.toml that describe devices, and virtual devices that send data in these formats."""
 
 from __future__ import annotations
 

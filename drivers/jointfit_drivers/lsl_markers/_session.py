@@ -50,7 +50,8 @@ _MOST_SAMPLES = 256
 _BUFFER_S = 10
 """Duration of the samples that the library stores while this host does not read, s."""
 _OTHERS = 32
-"""Number of streams after which the search for all streams ends. An error message lists them."""
+"""Number of streams after which the search for all streams ends, because an error message lists
+only some of them."""
 _LISTED = 8
 """Largest number of streams in an error message."""
 _FORMATS = dict(enumerate(("", "float32", "double64", "string", "int32", "int16", "int8", "int64")))
@@ -84,8 +85,8 @@ def _other_streams(streams: Sequence[Any]) -> str:
         )
         return f"; the network has {listed}: set stream in [mocap] to the stream of the cameras"
     return (
-        ": start the program that sends the stream, check the name (`jointfit probe --network` "
-        "lists streams), and that firewalls pass UDP 16571 and TCP 16572 to 16604"
+        ": start the program that sends the stream, check its name (`jointfit probe --network` "
+        "lists streams), and check that firewalls pass UDP 16571 and TCP 16572 to 16604"
     )
 
 

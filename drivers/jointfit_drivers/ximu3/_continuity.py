@@ -6,8 +6,8 @@ t0, t1 and t2. Their deviation from a uniform motion, as an angle in rad, is
 
     E = 2 |q2 - q1 - (q1 - q0) (t2 - t1) / (t1 - t0)|.
 
-For two successive messages, the limit for E is 0.005 rad plus twice the largest E of the last
-seconds. An acceleration of the sensor therefore raises the limit.
+If t2 - t1 is one period, the limit for E is 0.005 rad plus twice the largest E of the last seconds.
+After n periods the limit is n^2 times as large. An acceleration of the sensor raises the limit.
 
 | message                                       | outcome                                          |
 |-----------------------------------------------|--------------------------------------------------|
@@ -18,8 +18,8 @@ seconds. An acceleration of the sensor therefore raises the limit.
 | held one, and the rotation is possible        | advance like the arrival times                   |
 | none of the above                             | the held one is dropped, the next one is held    |
 
-Invariant: the result depends only on the values fed, and every input is accepted. During a motion
-within the range of the gyroscope, a message is held until the next message at most, and two
+Invariant: the result depends only on the values fed, and no input raises an exception. During a
+motion within the range of the gyroscope, a message is held until the next message at most, and two
 successive messages are never dropped.
 """
 
@@ -52,7 +52,8 @@ _LEARNED = 10
 """Smallest number of intervals whose mean is used as the period. With fewer intervals, the period
 is the shortest interval."""
 _LONGER = 20
-"""Number of consecutive intervals with the same number of periods that prove a changed rate."""
+"""If this number of consecutive intervals all last the same number of periods, and more than one,
+the rate has changed."""
 _MOST_COUNTED = 50
 """Longest interval that contributes to the mean, in periods."""
 _PACE_NS = 250_000_000

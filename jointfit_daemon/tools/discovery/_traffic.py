@@ -155,7 +155,10 @@ def decode_frames(
 def _candidate_tables(
     driver: type[Driver], sizes: Mapping[tuple[int, bool], int]
 ) -> Iterable[Mapping[str, Any]]:
-    """Return the tables that a driver proposes; if it proposes none, return the default table."""
+    """Return the tables to try for a CAN driver: those that it proposes, or the default table.
+
+    There are none for other drivers, or if no frame was received.
+    """
     if driver.wire != "can" or not sizes:
         return ()
     if hasattr(driver, "candidate_tables"):
