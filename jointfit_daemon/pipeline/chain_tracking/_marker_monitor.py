@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jointfit_daemon.kinematics.exchanged_labels import find_exchanged_labels
+from jointfit_daemon.limb_model import LabelFault
 from jointfit_daemon.model import MarkerFlag
 from jointfit_daemon.name_lists import join_words
 from jointfit_daemon.pipeline.chain_tracking._segment_labels import SegmentLabels
@@ -123,13 +124,13 @@ class MarkerMonitor:
 
     def exchanged_labels(self) -> list[str]:
         """Return a sentence for each current exchange of labels, without a full stop."""
-        return [self._exchange_text(m) for m in self._faults.values() if len(m) > 1]
+        return [self._exchange(m).text for m in self._faults.values() if len(m) > 1]
 
-    def _exchange_text(self, markers: tuple[int, ...], distances: str = "") -> str:
-        names = [self.model.markers[m].name for m in markers]
-        following = zip(names, names[1:] + names[:1], strict=True)
-        order = join_words(f"{name} is at the place of {other}" for name, other in following)
-        return f"{join_words(names)} look exchanged{distances}: {order}"
+    def _exchange(self, markers: tuple[int, ...]) -> LabelFault:
+        """Return the exchange of two or more labels."""
+        found = [self.model.markers[m] for m in markers]
+        parts = tuple(sorted({marker.segment for marker in found}))
+        return LabelFault(tuple(marker.name for marker in found), parts)
 
     def _hidden_since(self, seen_ns: int | None, t_ns: int) -> int:
         if seen_ns is not None:
@@ -269,13 +270,16 @@ class MarkerMonitor:
         names = [self.model.markers[m].name for m in markers]
         shown = join_words(f"{1000 * distances[m]:.0f} mm" for m in markers)
         if len(markers) > 1:
-            exchange = self._exchange_text(markers, f" ({shown} from their places in the model)")
-            text = f"{exchange}. Correct their labels; inverse kinematics excludes them until then"
+            text = (
+                f"{join_words(names)} look exchanged ({shown} from their places in the model): "
+                f"{self._exchange(markers).places}. Correct their labels; inverse kinematics "
+                "excludes them until then"
+            )
             return MarkerReport(names[0], MarkerFlag.EXCHANGED, text, {"markers": names})
         segment = self.model.markers[markers[0]].segment
         text = (
             f"{names[0]}: {shown} from its place on {segment} in the model: check its label, its "
-            "place and its segment. It is excluded until then"
+            "place and its segment. Inverse kinematics excludes it until then"
         )
         return MarkerReport(names[0], MarkerFlag.MISPLACED, text, {"segment": segment})
 
