@@ -3,9 +3,10 @@
     python -m bench.rigs.recording_process FOLDER [--seconds S] [--file-seconds S] [--stamps]
         [--without-recorder]
 
-The process ends after S seconds, or when it is killed. It prints ``ready`` when the input starts,
-and its cost as JSON at the end. With ``--stamps``, it also prints the time (CLOCK_MONOTONIC, ns)
-ten times per second, so that a reader knows what was recorded before a kill.
+The process ends after S seconds, or when it is killed. It prints ``ready`` when the input starts.
+At the end, it prints JSON with its CPU time, elapsed time, number of input bytes and peak memory.
+With ``--stamps``, it also prints the time (CLOCK_MONOTONIC, ns) ten times per second. After a kill,
+the last printed time is compared with the last recorded time.
 """
 
 from __future__ import annotations
