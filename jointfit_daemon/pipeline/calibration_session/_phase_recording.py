@@ -150,7 +150,7 @@ class PhaseRecording:
             return None
         return (
             f"static: {'; '.join(exchanged_labels)}. Correct the labels and repeat the phase; if "
-            "the labels are correct and the chain model is wrong, use force"
+            "the labels are correct and the chain model is wrong, request the phase with force"
         )
 
     @property

@@ -391,11 +391,9 @@ def handle_message(tracker: PhaseTracker, topic: str, payload: dict[str, Any]) -
     text = str(payload.get("text", ""))
     if topic == "calibration":
         tracker.on_status(payload)
-        return (
-            None
-            if sys.stderr.isatty() or not tracker.is_requested
-            else f"{payload.get('phase')}: {text}"
-        )
+        # The error message of the command contains the reason of an abort.
+        printed = tracker.is_requested and payload.get("phase") != "aborted"
+        return f"{payload.get('phase')}: {text}" if printed and not sys.stderr.isatty() else None
     if topic == "calibration/progress":
         tracker.on_progress(payload)
         return None

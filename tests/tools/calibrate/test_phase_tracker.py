@@ -290,7 +290,17 @@ async def test_stop_after_the_end_of_the_phase_reports_its_final_status(
 def test_retained_status_of_the_last_phase_is_not_printed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stderr", SimpleNamespace(isatty=lambda: False))
     one = PhaseTracker(lambda *_: None)
-    old = {"phase": "aborted", "text": "the phase of yesterday"}
+    old = {"phase": "posed", "text": "the phase of yesterday"}
     assert _command.handle_message(one, "calibration", old) is None
     one.begin()
-    assert _command.handle_message(one, "calibration", old) == "aborted: the phase of yesterday"
+    assert _command.handle_message(one, "calibration", old) == "posed: the phase of yesterday"
+
+
+def test_reason_of_an_abort_is_not_a_status_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reason is printed once, in the error message of the command."""
+    monkeypatch.setattr(sys, "stderr", SimpleNamespace(isatty=lambda: False))
+    one = PhaseTracker(lambda *_: None)
+    one.begin()
+    aborted = {"phase": "aborted", "text": "static: T1 and T2 look exchanged"}
+    assert _command.handle_message(one, "calibration", aborted) is None
+    assert one.status == aborted
